@@ -61,7 +61,7 @@ begun = replace(data.with_rows(lambda values: values[: WINDOW + 1]), lengths=dat
 problem = Problem(program, begun)
 with seeded(0, "paths"), torch.no_grad():
     start = smooth(problem, find_path(problem)).path(begun).states[-1]
-    given = (part[WINDOW:-1].unsqueeze(1) for part in (acting_controls(program, data)[: len(data.time)], data.elapsed))
+    given = (part[WINDOW:-1].unsqueeze(1) for part in (acting_controls(program, data), data.elapsed))
     run = roll_out(program, start[None, None], *given, data.steps[WINDOW:].unsqueeze(1), handler=AtMean())
     readings = measured(program, torch.cat([state[0] for state in run])).reading
 seen = data.observed[WINDOW + 1 :]

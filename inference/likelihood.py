@@ -23,6 +23,7 @@ from steady_ppl import (
 )
 from steady_ppl.errors import require
 from steady_ppl.kernels.rows import fallback_notes, kernel_failures
+from steady_ppl.likelihood.maximize import MIN_GAIN_OF_START
 from steady_ppl.likelihood.parameter_posterior import undetermined
 from steady_ppl.likelihood.parameters import elements, set_values, values_of
 from steady_ppl.model.problem import Problem
@@ -30,8 +31,6 @@ from steady_ppl.utils.progress import stages
 from steady_ppl.utils.text import reason_of
 
 from .steady import doubts
-
-MIN_GAIN_OF_START = 1.0  # nats by which a fit from another start must be likelier
 
 
 def fit(

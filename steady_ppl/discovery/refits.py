@@ -18,7 +18,14 @@ from steady_ppl.effects import Variant, attach, attached, coefficient
 from steady_ppl.errors import FilterError
 from steady_ppl.gaussian.linearize import ReferencePath
 from steady_ppl.gaussian.smoother import find_path
-from steady_ppl.likelihood.maximize import Information, Maximum, fit_by_likelihood, maximise, refit_outliers
+from steady_ppl.likelihood.maximize import (
+    MIN_GAIN_OF_START,
+    Information,
+    Maximum,
+    fit_by_likelihood,
+    maximise,
+    refit_outliers,
+)
 from steady_ppl.likelihood.parameters import Element, elements, values_of
 from steady_ppl.likelihood.scores import widens
 from steady_ppl.model.problem import Problem
@@ -28,7 +35,6 @@ from steady_ppl.utils.text import reason_of
 
 MAX_LOG_NOISE_RATIO = math.log(20.0)  # of noise after a fit and before, beyond which a program explains nothing
 AlongStates = TypeVar("AlongStates", bound=Trajectories | ReferencePath)
-MIN_GAIN_OF_START = 1.0  # nats by which a fit from another start must be likelier
 MAX_LOSS = 2.0  # nats below the program without, after which a fit is given up
 
 

@@ -322,7 +322,7 @@ def _rivals(found: Found) -> list[Candidate]:
 
 
 def _fitted_again(now: Refit, candidate: Candidate) -> Candidate:
-    """Beside other effects, from where it was."""
+    """On every fold, beside what `now` has, from where it was."""
     assert isinstance(candidate.refit, Refit)
     begin = candidate.refit.coefficient(candidate.variant)
     again = judged(now, candidate.tested, refit_with(now, candidate.variant, begin))
@@ -457,17 +457,9 @@ def _chosen(
     while True:
         best, ranked = judge.chosen(candidates, choose)
         most = max((c.total for c in ranked if c.is_judged), default=math.inf)
-        candidates = [c if c.is_judged or c.total <= most else _judged_after_all(judge.now, c) for c in ranked]
+        candidates = [c if c.is_judged or c.total <= most else _fitted_again(judge.now, c) for c in ranked]
         if all(one is other for one, other in zip(candidates, ranked, strict=True)):
             return best, ranked
-
-
-def _judged_after_all(now: Refit, candidate: Candidate) -> Candidate:
-    """A candidate that was given up, fitted on every fold."""
-    assert isinstance(candidate.refit, Refit)
-    begin, known = candidate.refit.coefficient(candidate.variant), candidate.refit.maxima[0]
-    again = judged(now, candidate.tested, refit_with(now, candidate.variant, begin, information=known))
-    return at_its_best_place(now, again)
 
 
 def _threshold(candidates: Sequence[Candidate]) -> Threshold:

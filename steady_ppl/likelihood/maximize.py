@@ -63,6 +63,7 @@ no score there, and a fit cannot return."""
 SHARE_THAT_GOES_ON = 0.8  # share of fits that take one step more, by which the time left is told
 CONVERGED_DECREMENT = 0.1  # nats that another step may gain where a fit has converged
 MAX_DECREASE = 0.3  # nats below the most so far to which an objective may fall: paths are nearly at rest
+MIN_GAIN_OF_START = 1.0  # nats by which a fit from another start must be likelier
 MAX_ROUGHNESS = 1.5  # mean square deviation, in the program's own, from which noise is widened before a fit
 OUTLIER_SD, SEARCHES = 6.0, 3  # standard deviations by which an outlier is less likely, and searches for its path
 

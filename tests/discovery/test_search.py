@@ -116,15 +116,15 @@ def test_what_loses_or_imitates_sets_no_bar_for_what_is_fitted_after_it(monkeypa
 @pytest.mark.parametrize(("total", "expected"), [(25.0, "lever"), (20.0, "limit"), (9.0, "limit")])
 def test_what_was_given_up_is_judged_after_all_where_it_is_ahead_of_what_a_filter_leaves(monkeypatch, total, expected):
     """It stayed behind a limit whose linearised log p(y) promises ten nats more than a filter finds."""
-    limit, lever, known = Chosen("limit", 30.0), Chosen("lever", total), "information of its first fold"
+    limit, lever = Chosen("limit", 30.0), Chosen("lever", total)
     limit.is_confirmed = lever.is_judged = lever.is_confirmed = False
-    lever.tested, lever.refit.__dict__["maxima"] = "test", [known]
+    lever.tested = "test"
     monkeypatch.setattr(Refit, "coefficient", lambda self, variant: 3.5)
     monkeypatch.setattr(search, "at_its_best_place", lambda now, candidate: candidate)
     asked = []
 
-    def refit_with(now, variant, begin, *, information):
-        asked.append((now, variant.name, begin, information))
+    def refit_with(now, variant, begin):
+        asked.append((now, variant.name, begin))
         return "refit"
 
     def judge(now, tested, refit):
@@ -140,7 +140,7 @@ def test_what_was_given_up_is_judged_after_all_where_it_is_ahead_of_what_a_filte
     ranking = search.partial(search._first, lambda c: c.total > 2)
     best, ranked = search._chosen(search.ParticleJudge("now"), [lever, limit], ranking)
     assert best.name == expected and best.total == max(20.0, total) and len(ranked) == 2
-    assert asked == [("now", "lever", 3.5, known)] * (expected == "lever")
+    assert asked == [("now", "lever", 3.5)] * (expected == "lever")
 
 
 def test_a_knee_is_moved_beside_what_is_added_after_it(monkeypatch):
