@@ -159,7 +159,8 @@ def main(arguments: list[str] | None = None) -> int:
     for option in command.params:
         if isinstance(option, typer.core.TyperOption) and option.name in COMPLETION_OPTIONS:
             option.hidden = True
-    typed = shlex.join(["steady", *(word for word in arguments if word not in ("--resume", "--force"))])
+    read = ["--units-row"] if "units row" in asked else []
+    typed = shlex.join(["steady", *(word for word in arguments if word not in ("--resume", "--force")), *read])
     with (
         bound(QUIET, "quiet" in asked),
         bound(UNITS_ROW, "units row" in asked),

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import json
 import warnings
 from pathlib import Path
 
 import pytest
 import torch
 from small import steady
+from small_studies import CART
 
 import steady_ppl as st
 
@@ -107,6 +109,18 @@ def test_a_name_that_ends_with_a_blank_is_not_written_as_csv(tmp_path: Path) -> 
     st.write_table(drives, tmp_path / "drives.parquet")
     with pytest.raises(st.DataError, match="column y.range : a name ends with a blank"):
         st.write_table(drives, tmp_path / "drives.csv")
+
+
+def test_a_record_says_that_the_table_had_units(tmp_path: Path) -> None:
+    """Else its command, typed again, is refused."""
+    plain = st.simulate(st.load_program(CART), 2, seed=1)
+    st.write_table(plain, tmp_path / "drives.csv")
+    header, _, rest = (tmp_path / "drives.csv").read_text().partition("\n")
+    names = header.split(",")
+    (tmp_path / "drives.csv").write_text(f"{header}\n{','.join('s' for _ in names)}\n{rest}")
+    words = ("fit", CART, tmp_path / "drives.csv", "--recipe", "hand", "--out", tmp_path / "run")
+    assert steady(*words, "--units-row") == 0
+    assert "--units-row" in json.loads((tmp_path / "run/run.json").read_text())["command"]
 
 
 def test_the_command_line_says_once_how_a_table_was_read(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
