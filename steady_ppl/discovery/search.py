@@ -58,7 +58,9 @@ MAX_SHIFT_OF_SIZES = 0.08  # nats by which twice the substeps may move what is r
 MAX_SUBSTEPS_OF_FIT = 128  # of a fitted program, at most: what a coarser step leaves would be named as an effect
 MAX_EFFECTS, MAX_CURVES = 5, 3  # effects in a program, and adding curves that are fitted
 MAX_ROUNDS = MAX_EFFECTS + 3  # with factors on noise, which take no place, and a last test
+MAX_FINER_SEARCHES = 2  # that begin again at a step for which what was found asks
 LOOKING, FINER = "testing and fitting effects", "looking again at a finer time step"  # that may be interrupted
+NOT_FINER = "what was found was not looked at in finer time steps: {}"
 NOTHING_TESTED = "the program as it stands was fitted, and no effect has been tested yet"
 
 
@@ -132,7 +134,8 @@ class Search:
     gained: float  # nats that fitting the program as it stands gained on the training drives
     outliers: list[Outliers] = field(default_factory=list)  # of the training and of the validation drives
     corrections: list[Correction] = field(default_factory=list)  # of the noise that it declares
-    with_found: StepCheck | None = None  # the same with what was found, where that asked for a search at a finer step
+    with_found: StepCheck | None = None  # the same with what was found at a coarser step, which asked for this one
+    asks: StepCheck | None = None  # the same with what was found here, where that asks for a finer step
     rounds: list[Round] = field(default_factory=list)  # the last tests the final program unless the search ended early
     found: list[Found] = field(default_factory=list)  # the effects that were added
     curves: list[Candidate] = field(default_factory=list)  # fitted in place of the first effect, best first
@@ -140,6 +143,7 @@ class Search:
     notes: list[str] = field(default_factory=list)  # what could not be done
     interrupted: str = ""  # what was being done when an interrupt (Ctrl-C) came; empty as a rule
     cut_short: bool = False  # whether the interrupt came before the search had ended
+    compared: list[str] = field(default_factory=list)  # the effects beside which steps were last compared
 
     def interrupt(self, doing: str, *, cut_short: bool = True) -> None:
         """End with what has been found so far."""
@@ -161,7 +165,7 @@ class Search:
     @property
     def departed(self) -> list[Tested]:
         """What says, in the last tests, that the fitted noise is not the declared; a missing effect may say so too."""
-        if self.interrupted == LOOKING:
+        if self.interrupted in (LOOKING, FINER):
             return []
         tests = self.rounds[-1].screening.tests
         return [tested for tested in tests.tested if tested.departure and tested.p_value <= tests.critical]
@@ -206,25 +210,32 @@ def search(problem: Problem, valid: Trajectories, settings: Settings) -> Search:
             base, corrections = with_suitable_noise(own, settings.corrects, tails)
         begin()
         found = _rounds(Search(own, base, base, step, gained, outliers, corrections), settings)
-        if not found.found or found.interrupted:
-            return found
-        try:
-            parameters = [variant.parameter for variant in attached(found.final.program)]
-            with_found = _step_of(found.final, watched=parameters, max_shift=MAX_SHIFT_OF_SIZES)
-            if with_found.too_coarse:  # what was found asks for a finer step: sizes are those of that step
-                finer = with_found.suited.substeps
-                own = fit(with_substeps(program, finer), left, valid, with_substeps(own.program, finer))
-                base, corrections = with_suitable_noise(own, settings.corrects, tails)
-                settings = replace(settings, declared=with_substeps(settings.declared, finer))
-                fresh = Search(own, base, base, step, gained, outliers, corrections, with_found)
-                again = _rounds(fresh, settings, carried=found.found)
-                if not again.interrupted:
-                    return again
+
+        def at_finer_step(found: Search, is_last: bool) -> Search:
+            """The search again at the step for which what was found asks: sizes are those of that step."""
+            assert found.asks is not None
+            finer = found.asks.suited.substeps
+            own = fit(with_substeps(program, finer), left, valid, with_substeps(found.as_it_stands.program, finer))
+            base, corrections = with_suitable_noise(own, settings.corrects, tails)
+            there = replace(settings, declared=with_substeps(settings.declared, finer))
+            fresh = Search(own, base, base, step, gained, outliers, corrections, found.asks)
+            return _rounds(fresh, there, carried=found.found, looks_at_step=not is_last)
+
+        for index in range(MAX_FINER_SEARCHES):
+            if found.asks is None or found.interrupted:
+                break
+            try:
+                again = at_finer_step(found, index == MAX_FINER_SEARCHES - 1)
+                if again.interrupted and len(again.found) < len(found.found):
+                    found.interrupt(FINER)
+                else:
+                    found = again
+            except KeyboardInterrupt:
                 found.interrupt(FINER)
-        except KeyboardInterrupt:
-            found.interrupt(FINER)
-        except Exception as error:  # also of the program's own code, in steps that nobody tried before
-            found.notes.append(f"what was found was not looked at in finer time steps: {reason_of(error)}")
+            except Exception as error:  # also of the program's own code, in steps that nobody tried before
+                fresh = Search(own, base, base, step, gained, outliers, corrections)
+                found = _rounds(fresh, settings, looks_at_step=False)
+                found.notes.append(NOT_FINER.format(reason_of(error)))
     return found
 
 
@@ -234,22 +245,41 @@ def _step_of(refit: Refit, **watched: Any) -> StepCheck:
     return check_step(*given, known_start=refit.folds[0].known_start, finest=MAX_SUBSTEPS_OF_FIT, **watched)
 
 
-def _rounds(found: Search, settings: Settings, carried: Sequence[Found] = ()) -> Search:
+def _look_at_step(found: Search) -> None:
+    """Compare time steps beside what was found, unless they were compared beside the same effects."""
+    there = [variant.name for variant in attached(found.final.program)]
+    if not found.found or found.compared == there:
+        return
+    try:
+        parameters = [variant.parameter for variant in attached(found.final.program)]
+        check = _step_of(found.final, watched=parameters, max_shift=MAX_SHIFT_OF_SIZES)
+        found.asks = check if check.too_coarse else None
+    except Exception as error:  # also of the program's own code, in steps that nobody tried before
+        found.notes.append(NOT_FINER.format(reason_of(error)))
+    found.compared = there
+
+
+def _rounds(found: Search, settings: Settings, carried: Sequence[Found] = (), *, looks_at_step: bool = True) -> Search:
     """Test, fit and add until nothing is left, or until an interrupt (Ctrl-C) after the first tests.
 
-    What was found at a coarser step and is `carried` is added after the first round, as far as it is needed.
+    What was found at a coarser step and is `carried` is added after the first round, as far as it is needed. Where it
+    `looks_at_step`, it ends as soon as what was found `asks` for a finer one.
     """
     with stages(("", 6), ("looking again", 1), ("fitting curves", 1)) as begin:
         doing = LOOKING
         try:
             begin()
-            _add_all(found, settings, carried)
+            _add_all(found, settings, carried, looks_at_step)
             doing = "looking again at what was found"
             begin()
-            if len(found.found) > 1:
+            if found.asks is None and len(found.found) > 1:
                 _look_again(found, settings)
+                if looks_at_step:
+                    _look_at_step(found)
             doing = "fitting curves"
             begin()
+            if found.asks is not None:
+                return found
             if found.found and not found.curves and (len(found.found) > 1 or not found.rounds[1].nothing_found):
                 found.curves = _curves(found)
             if found.found:
@@ -276,7 +306,7 @@ def _drop_corrections(found: Search, settings: Settings) -> None:
     found.rounds, found.final, found.corrections = [*found.rounds, last], final, kept
 
 
-def _add_all(found: Search, settings: Settings, carried: Sequence[Found]) -> None:
+def _add_all(found: Search, settings: Settings, carried: Sequence[Found], looks_at_step: bool) -> None:
     """Test, fit and add one effect after another; at first what is `carried`."""
     near = {rival.variant.name for one in carried for rival in _rivals(one)}
     shares = [(said, 0.5**index) for index in range(MAX_ROUNDS) for said in ("testing every effect", "")]
@@ -299,6 +329,10 @@ def _add_all(found: Search, settings: Settings, carried: Sequence[Found]) -> Non
                 break
             if index == 0:
                 _carry(found, carried)
+            if looks_at_step:
+                _look_at_step(found)
+            if found.asks is not None:
+                break
 
 
 def _carry(found: Search, carried: Sequence[Found]) -> None:
@@ -355,7 +389,9 @@ def _add_best(found: Search, screening: Screening, index: int, near: Collection[
     candidates, best = list[Candidate](), None
 
     def is_enough(candidate: Candidate) -> bool:
-        return candidate.significant(screening.tests.critical) and (index == 0 or curve.admits(candidate))
+        if not candidate.significant(screening.tests.critical):
+            return False
+        return index == 0 or not candidate.is_confirmed or curve.admits(candidate)  # fitting a curve costs more
 
     groups = _groups(leaders(screening.tests, index == 0), near)
     for group in groups:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import pytest
@@ -234,31 +235,109 @@ def test_in_the_first_round_coloured_noise_waits_for_curves(monkeypatch, curve, 
     assert [one.candidate.name for one in found.found] == ([expected] if expected else [])
 
 
-@pytest.mark.parametrize("failure", [RuntimeError("the tide is out"), KeyboardInterrupt()])
-def test_what_was_found_stays_where_finer_time_steps_fail_or_are_interrupted(monkeypatch, failure):
-    step = SimpleNamespace(too_coarse=False)
+def quiet_round():
+    tests = SimpleNamespace(p_value=0.5, tested=[], critical=0.01)
+    return search.Round(SimpleNamespace(tests=tests), [], None)
+
+
+@pytest.fixture
+def asking(monkeypatch):
+    """A search that has found a drag, beside which its step is too coarse, and how to say what its rounds come to."""
     base = SimpleNamespace(maxima=[SimpleNamespace(gained=0.0)], program=None)
-
-    def looked_at(refit, **watched):
-        if watched:
-            raise failure
-        return step
-
     cleaned = (base, Suited(base, []), 2 * [SimpleNamespace(left=None)], base)
     monkeypatch.setattr(search, "without_outliers", lambda *_: cleaned)
     monkeypatch.setattr(search, "with_suitable_noise", lambda base, wanted, tails: Suited(base, []))
-    monkeypatch.setattr(search, "attached", lambda program: [])
-    monkeypatch.setattr(search, "_step_of", looked_at)
-    rounds = [search.Round(SimpleNamespace(tests=SimpleNamespace(p_value=0.5, tested=[], critical=0.01)), [], None)]
-    ended = search.Search(base, base, base, step, 0.0, found=[Found(Chosen("drag", 9.0), [], None)], rounds=rounds)
-    monkeypatch.setattr(search, "_rounds", lambda *_: ended)
-    found = search.search(SimpleNamespace(program=None, data=None), None, search.Settings(declared=None))
-    assert found is ended and len(found.found) == 1
-    if isinstance(failure, KeyboardInterrupt):
-        assert found.interrupted == search.FINER and not found.is_complete
-    else:
-        assert found.notes == ["what was found was not looked at in finer time steps: RuntimeError: the tide is out"]
-        assert found.is_complete
+    monkeypatch.setattr(search, "_step_of", lambda refit: SimpleNamespace(too_coarse=False))
+    monkeypatch.setattr(search, "first_refit", lambda *_, **__: base)
+    monkeypatch.setattr(search, "with_substeps", lambda program, count: f"{count} substeps")
+    found = [Found(Chosen("drag", 9.0), [], None)]
+    coarse = search.Search(base, base, base, None, 0.0, found=found, rounds=[quiet_round()])
+    coarse.asks = SimpleNamespace(suited=SimpleNamespace(substeps=4))
+
+    def come_to(*outcomes):
+        """Run the search, whose rounds come to these, one after another; it and how each was asked for."""
+        left, asked = list(outcomes), []
+
+        def rounds(fresh, settings, carried=(), *, looks_at_step=True):
+            asked.append((settings.declared, [one.candidate.name for one in carried], looks_at_step, fresh.with_found))
+            outcome = left.pop(0)
+            if isinstance(outcome, BaseException):
+                raise outcome
+            return outcome
+
+        monkeypatch.setattr(search, "_rounds", rounds)
+        problem = SimpleNamespace(program=None, data=None, known_start=False)
+        return search.search(problem, None, search.Settings(declared=None)), asked
+
+    return coarse, come_to
+
+
+def test_a_search_begins_again_at_the_step_for_which_what_was_found_asks(asking):
+    coarse, come_to = asking
+    finer = search.Search(None, None, None, None, 0.0)
+    found, asked = come_to(coarse, finer)
+    assert found is finer
+    assert asked == [(None, [], True, None), ("4 substeps", ["drag"], True, coarse.asks)]
+
+
+def test_the_second_search_at_a_finer_step_is_the_last(asking):
+    coarse, come_to = asking
+    finest = replace(coarse)
+    found, asked = come_to(coarse, coarse, finest)
+    assert found is finest and [looks for *_, looks, _ in asked] == [True, True, False]
+
+
+def test_where_finer_time_steps_fail_the_search_ends_at_its_own_step(asking):
+    coarse, come_to = asking
+    whole = replace(coarse, asks=None, notes=[])
+    found, asked = come_to(coarse, RuntimeError("the tide is out"), whole)
+    assert found is whole and asked[-1] == (None, [], False, None)
+    assert found.notes == ["what was found was not looked at in finer time steps: RuntimeError: the tide is out"]
+    assert found.is_complete
+
+
+@pytest.mark.parametrize("is_ahead", [True, False])
+def test_an_interrupt_at_a_finer_time_step_leaves_the_search_that_has_found_more(asking, is_ahead):
+    coarse, come_to = asking
+    again = search.Search(None, None, None, None, 0.0, found=coarse.found if is_ahead else [])
+    again.interrupt(search.LOOKING)
+    found, _ = come_to(coarse, again)
+    assert found is (again if is_ahead else coarse)
+    assert found.interrupted == (search.LOOKING if is_ahead else search.FINER)
+
+
+def test_an_interrupt_before_the_first_tests_at_a_finer_time_step_leaves_the_coarser_search(asking):
+    coarse, come_to = asking
+    found, _ = come_to(coarse, KeyboardInterrupt(search.NOTHING_TESTED))
+    assert found is coarse and found.interrupted == search.FINER and not found.is_complete and not found.departed
+
+
+@pytest.mark.parametrize("fails", [False, True])
+def test_time_steps_are_compared_once_beside_the_same_effects(monkeypatch, fails):
+    looked = []
+
+    def step_of(refit, **watched):
+        looked.append(watched["watched"])
+        if fails:
+            raise RuntimeError("the tide is out")
+        return SimpleNamespace(too_coarse=len(looked) > 1)
+
+    monkeypatch.setattr(search, "_step_of", step_of)
+    monkeypatch.setattr(search, "attached", lambda program: program)
+    drag, lag = (SimpleNamespace(name=name, parameter=name) for name in ("drag", "lag"))
+    found = search.Search(None, None, SimpleNamespace(program=[drag]), None, 0.0)
+    search._look_at_step(found)
+    assert not looked  # nothing was found
+    found.found = [Found(Chosen("drag", 9.0), [], None)]
+    for _ in range(2):
+        search._look_at_step(found)
+    assert looked == [["drag"]] and found.asks is None
+    found.final = SimpleNamespace(program=[drag, lag])
+    search._look_at_step(found)
+    assert looked == [["drag"], ["drag", "lag"]] and (found.asks is None) == fails
+    assert found.notes == 2 * fails * [
+        "what was found was not looked at in finer time steps: RuntimeError: the tide is out"
+    ]
 
 
 @pytest.mark.parametrize(
@@ -307,7 +386,7 @@ def test_without_tests_of_what_was_carried_the_search_at_a_finer_step_fails(monk
     found = search.Search(None, "base", "base", None, 0.0)
     if carried:
         with pytest.raises(RuntimeError, match="tide"):
-            search._add_all(found, search.Settings(declared=None), carried)
+            search._add_all(found, search.Settings(declared=None), carried, False)
     else:
-        search._add_all(found, search.Settings(declared=None), carried)
+        search._add_all(found, search.Settings(declared=None), carried, False)
         assert found.taken_back == {"drag": "RuntimeError: the tide is out"} and found.final == "base"
