@@ -44,6 +44,7 @@ from steady_ppl.utils.random import seeded
 
 MIN_LEADERS, MIN_ALIAS_CORRELATION = 6, 0.85  # how many are refitted, and those whose columns are so like the first's
 MAX_PLACES_OF_SENSOR_EFFECT = 2  # measurements at which one effect is refitted: of thirty landmarks each may be biased
+MAX_NATS_OF_RIVAL = 12.0  # nats behind the best in its round, with which one is fitted again beside other effects
 TIE_NATS = 2.0  # of held-out log p(y) within which two candidates cannot be told apart
 CLEAR_GAIN = 10.0  # nats of held-out log p(y) for which a test need only be near the family's level
 NEAR_FAMILY_LEVEL = FAMILY_LEVEL / 5  # p-value of a single test that is near it
@@ -228,7 +229,7 @@ def attempts(
         for tested, one in zip(chosen, known, strict=True)
     ]  # scoring steps go from there as far as the likelihood rises
     starts = [t.variant.absent(now.held_out) if zero else _start(t) for t, zero in zip(chosen, from_zero, strict=True)]
-    made = [attempt_with(now, t.variant, start, one) for t, start, one in zip(chosen, starts, known, strict=True)]
+    made = [attempt_with(now, [(t.variant, start)], one) for t, start, one in zip(chosen, starts, known, strict=True)]
     given = zip(chosen, begin(now, made, threshold), known, from_zero, strict=True)
     return [partial(_fitted, now, *one) for one in given]
 
@@ -345,6 +346,16 @@ def likelier_places(base: Refit, begun: Fits, at: Variant) -> list[tuple[Variant
             if not any(moved):
                 break
     return fits
+
+
+def moved_to_likelier_place(base: Refit, refit: Refit, variant: Variant) -> Refit:
+    """A fitted program with the knee or place of one of its effects, which `base` lacks, where it is likeliest."""
+    if not variant.profiled:
+        return refit
+    *_, (_, fits) = likelier_places(base, refit, variant)
+    if fits is refit or isinstance(moved := judged_fits(fits), str):
+        return refit
+    return moved
 
 
 def variance_of_places(now: Refit, candidate: Candidate) -> Tensor:

@@ -19,7 +19,8 @@ from steady_ppl.discovery.finding import NextRun, corrections, findings, next_ru
 from steady_ppl.discovery.fitting import ByDraws
 from steady_ppl.discovery.refits import Refit, with_states_of
 from steady_ppl.discovery.result import Discovery
-from steady_ppl.discovery.search import MAX_EFFECTS, Found, Search, Settings, search
+from steady_ppl.discovery.search import Settings, search
+from steady_ppl.discovery.search_state import MAX_EFFECTS, Found, Search
 from steady_ppl.effects import catalogue, of_name, record, restore, written_class
 from steady_ppl.effects.declaration import VERDICT_OF_FORM
 from steady_ppl.errors import DataError, FilterError, UsageError

@@ -16,7 +16,7 @@ from steady_ppl.discovery.candidates import Candidate, spread_of, variance_of_pl
 from steady_ppl.discovery.judges import MIN_GAIN_OF_CURVE
 from steady_ppl.discovery.refits import Refit, with_states_of
 from steady_ppl.discovery.screening import NOISE_SIZES, Tested
-from steady_ppl.discovery.search import Found, Search
+from steady_ppl.discovery.search_state import Found, Search
 from steady_ppl.effects import Effect, Variant, attached
 from steady_ppl.gaussian.predict import HALF_WIDTH, simulate_again
 from steady_ppl.gaussian.smoother import smooth

@@ -24,6 +24,12 @@ NEGLIGIBLE_NATS = 1.0  # by which a filter may rank otherwise before it is asked
 Choice = Callable[[Sequence[Candidate]], Candidate | None]  # of candidates, best first
 
 
+def first_enough(is_enough: Callable[[Candidate], bool], ranked: Sequence[Candidate]) -> Candidate | None:
+    """The best candidate that brings enough, one that explains something before one that does not."""
+    able = sorted((c for c in ranked if c.is_judged and not c.against_its_sign), key=lambda c: not c.is_explanation)
+    return next((c for c in able if is_enough(c)), None)
+
+
 @dataclass(frozen=True)
 class ParticleJudge:
     """Log p(y) of held-out drives by a filter that looks ahead, for candidates of a program `now`.

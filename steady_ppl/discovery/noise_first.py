@@ -138,6 +138,13 @@ def with_suitable_noise(own: Refit, wanted: Callable[[Variant], bool], tails: Va
     return Suited(base, found)
 
 
+def with_same_noise(own: Refit, suited: Refit, corrections: list[Correction]) -> Suited | None:
+    """A fitted program with the corrections that it has at another time step, fitted from there; None: it fails."""
+    near = fit_near(own, suited, [one.variant for one in corrections])
+    refit = near if isinstance(near, str) else judged_fits(near)
+    return None if isinstance(refit, str) else Suited(replace(refit, unwidened=suited.unwidened), corrections)
+
+
 def _held_out(refit: Refit) -> float:
     return float(refit.held_out.sum())
 

@@ -35,6 +35,7 @@ from steady_ppl.utils.text import reason_of
 
 MAX_LOG_NOISE_RATIO = math.log(20.0)  # of noise after a fit and before, beyond which a program explains nothing
 AlongStates = TypeVar("AlongStates", bound=Trajectories | ReferencePath)
+Value = float | Sequence[float] | Tensor  # of a coefficient
 MAX_LOSS = 2.0  # nats below the program without, after which a fit is given up
 
 
@@ -89,6 +90,11 @@ class Fits:
     def program(self) -> Program:
         """The one fitted on the first fold."""
         return self.programs[0]
+
+    @property
+    def effects(self) -> list[str]:
+        """The labels of its program's effects."""
+        return [variant.label for variant in attached(self.program)]
 
     def mean_coefficient(self, variant: Variant) -> Tensor:
         """An effect's coefficient in these fits, whose noise is each fold's own."""
@@ -230,17 +236,16 @@ class Attempt:
 
 
 def attempt_with(
-    base: Refit,
-    variant: Variant,
-    value: float | Sequence[float] | Tensor,
-    information: Tensor | Maximum | None = None,
+    base: Refit, effects: Sequence[tuple[Variant, Value]], information: Tensor | Maximum | None = None
 ) -> Attempt | str:
-    """The program with an effect whose coefficient begins at `value`, or why it cannot be had.
+    """The program with effects whose coefficients begin at these values, or why it cannot be had.
 
-    `information` is that of the first fold's drives, the coefficient last, or a fit that learned all these numbers.
+    `information` is that of the first fold's drives, the coefficients last, or a fit that learned all these numbers.
     """
     try:
-        programs = [attach(copy.deepcopy(program), variant, value) for program in base.programs]
+        programs = [copy.deepcopy(program) for program in base.programs]
+        for variant, value in effects:
+            programs = [attach(program, variant, value) for program in programs]
         if isinstance(information, Maximum):
             return Attempt(programs, _information(information, elements(programs[0])))
         return Attempt(programs, information)
@@ -287,13 +292,18 @@ def _floor(without: Maximum, threshold: Threshold = NO_THRESHOLD) -> float:
 def refit_with(
     base: Refit,
     variant: Variant,
-    value: float | Sequence[float] | Tensor,
+    value: Value,
     *,
     information: Tensor | Maximum | None = None,
     threshold: Threshold = NO_THRESHOLD,
 ) -> Refit | str:
     """The program with an effect, see `attempt_with`, fitted."""
-    return finish(base, attempt_with(base, variant, value, information), threshold)
+    return finish(base, attempt_with(base, [(variant, value)], information), threshold)
+
+
+def refit_with_all(base: Refit, effects: Sequence[tuple[Variant, Value]], near: Maximum) -> Refit | str:
+    """The program with effects, see `attempt_with`, fitted; `near` has learned their numbers beside others."""
+    return finish(base, attempt_with(base, effects, near))
 
 
 def fit_near(

@@ -13,7 +13,7 @@ from steady_ppl.comparison.result import Proof
 from steady_ppl.discovery.candidates import Candidate
 from steady_ppl.discovery.finding import Finding, NextRun, Shape, gain_interval
 from steady_ppl.discovery.screening import FAMILY_LEVEL, Tested
-from steady_ppl.discovery.search import Search
+from steady_ppl.discovery.search_state import Search
 from steady_ppl.errors import RunError
 from steady_ppl.runs.fit import Fit
 from steady_ppl.runs.folder import DISCOVERY

@@ -7,15 +7,15 @@ is held-out log p(y), each drive judged by a program that was fitted without it,
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
 from steady_ppl.criticism.step_size import StepCheck, check_step
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.discovery.candidates import (
-    CLEAR_GAIN,
+    MAX_NATS_OF_RIVAL,
     NEAR_FAMILY_LEVEL,
     TIE_NATS,
     UNEXPLAINED,
@@ -26,40 +26,33 @@ from steady_ppl.discovery.candidates import (
     bar_of,
     judged,
     leaders,
-    likelier_places,
+    moved_to_likelier_place,
     screen_program,
 )
-from steady_ppl.discovery.judges import MIN_GAIN_OF_CURVE, Choice, CurveJudge, ParticleJudge
-from steady_ppl.discovery.noise_first import Correction, needless, with_suitable_noise, without, without_outliers
+from steady_ppl.discovery.judges import MIN_GAIN_OF_CURVE, Choice, CurveJudge, ParticleJudge, first_enough
+from steady_ppl.discovery.noise_first import needless, with_same_noise, with_suitable_noise, without, without_outliers
+from steady_ppl.discovery.prune import prune
 from steady_ppl.discovery.refits import (
     NO_THRESHOLD,
-    Fits,
     Refit,
     Threshold,
     first_refit,
-    fit_near,
-    judged_fits,
     refit_with,
 )
-from steady_ppl.discovery.screening import FAMILY_LEVEL, NOISE_SIZES, Tested
+from steady_ppl.discovery.screening import Tested
+from steady_ppl.discovery.search_state import FINER, LOOKING, MAX_EFFECTS, Found, Round, Search, with_places_of
 from steady_ppl.effects import Effect, Variant, attached
-from steady_ppl.likelihood.outliers import Outliers
 from steady_ppl.model.problem import Problem
 from steady_ppl.model.program import Program
 from steady_ppl.model.substeps import with_substeps
-from steady_ppl.utils.journal import close_journal
 from steady_ppl.utils.progress import stages
 from steady_ppl.utils.text import reason_of
 
-MAX_NATS_OF_RIVAL = 12.0  # nats behind the best in its round, with which one is fitted again beside other effects
-SAME_MAXIMUM = 0.2  # nats within which fits from two starts have ended at the same place
-MIN_NATS_OF_DIVERGENCE = 25.0  # nats above every fit that it is a part of, from which a fit is not to be believed
 MAX_SHIFT_OF_SIZES = 0.08  # nats by which twice the substeps may move what is reported: 0.4 standard deviations
 MAX_SUBSTEPS_OF_FIT = 128  # of a fitted program, at most: what a coarser step leaves would be named as an effect
-MAX_EFFECTS, MAX_CURVES = 5, 3  # effects in a program, and adding curves that are fitted
+MAX_CURVES = 3  # adding curves that are fitted
 MAX_ROUNDS = MAX_EFFECTS + 3  # with factors on noise, which take no place, and a last test
 MAX_FINER_SEARCHES = 2  # that begin again at a step for which what was found asks
-LOOKING, FINER = "testing and fitting effects", "looking again at a finer time step"  # that may be interrupted
 NOT_FINER = "what was found was not looked at in finer time steps: {}"
 NOTHING_TESTED = "the program as it stands was fitted, and no effect has been tested yet"
 
@@ -87,103 +80,6 @@ class Settings:
         """Test every candidate that a fitted program does not have, in a round counted from 0."""
         sets = self.later_sets if index else self.sets
         return screen_program(now, self.declared, sets=sets, seed=self.seed + index, wanted=self.wants)
-
-
-@dataclass(frozen=True)
-class Round:
-    """What was tested, fitted and chosen."""
-
-    screening: Screening  # the tests of the program so far
-    candidates: list[Candidate]  # those that were fitted, best first
-    chosen: Candidate | None  # what is added, None when the round ends the search
-
-    @property
-    def nothing_found(self) -> bool:
-        return self.screening.tests.p_value > FAMILY_LEVEL
-
-
-@dataclass(frozen=True)
-class Found:
-    """An effect that was chosen."""
-
-    candidate: Candidate  # the best
-    candidates: list[Candidate]  # all that were fitted in its place, best first
-    without: Refit  # the program without it
-
-    @property
-    def rivals(self) -> list[Candidate]:
-        """Those that may be what the best stands for: what imitates anything is no rival of an explanation."""
-        return [c for c in self.candidates if c.is_explanation or not self.candidate.is_explanation]
-
-    @property
-    def aliases(self) -> list[Candidate]:
-        """Those that these drives cannot tell from the best, itself first, wherever its knee is."""
-        best = self.candidate
-        close = [c for c in self.rivals if c.total >= best.total - TIE_NATS and not c.against_its_sign]
-        return [best, *(c for c in close if c is not best and c.variant.name != best.variant.name)]
-
-
-@dataclass
-class Search:
-    """The state of a search: what it has come to so far."""
-
-    as_it_stands: Refit  # the program, fitted
-    base: Refit  # the same with noise that is corrected, from which the search begins
-    final: Refit  # the program with all effects that were found, fitted
-    step: StepCheck  # the base beside itself at finer steps; all else is at the step that suits
-    gained: float  # nats that fitting the program as it stands gained on the training drives
-    outliers: list[Outliers] = field(default_factory=list)  # of the training and of the validation drives
-    corrections: list[Correction] = field(default_factory=list)  # of the noise that it declares
-    with_found: StepCheck | None = None  # the same with what was found at a coarser step, which asked for this one
-    asks: StepCheck | None = None  # the same with what was found here, where that asks for a finer step
-    rounds: list[Round] = field(default_factory=list)  # the last tests the final program unless the search ended early
-    found: list[Found] = field(default_factory=list)  # the effects that were added
-    curves: list[Candidate] = field(default_factory=list)  # fitted in place of the first effect, best first
-    taken_back: dict[str, str] = field(default_factory=dict)  # effects with which the program failed, and how
-    notes: list[str] = field(default_factory=list)  # what could not be done
-    interrupted: str = ""  # what was being done when an interrupt (Ctrl-C) came; empty as a rule
-    cut_short: bool = False  # whether the interrupt came before the search had ended
-    compared: list[str] = field(default_factory=list)  # the effects beside which steps were last compared
-
-    def interrupt(self, doing: str, *, cut_short: bool = True) -> None:
-        """End with what has been found so far."""
-        close_journal()
-        self.interrupted, self.cut_short = doing, cut_short
-
-    @property
-    def is_complete(self) -> bool:
-        """Whether the tests of the last round found nothing more that an effect or a curve could bring."""
-        tests = self.rounds[-1].screening.tests
-        quiet = not any(tested.p_value <= tests.critical for tested in tests.tested if not tested.departure)
-        return quiet and not self.cut_short
-
-    @property
-    def is_full(self) -> bool:
-        """Whether it has as many effects as it may; factors on noise take no place."""
-        return sum(one.candidate.variant.effect.name not in NOISE_SIZES for one in self.found) >= MAX_EFFECTS
-
-    @property
-    def departed(self) -> list[Tested]:
-        """What says, in the last tests, that the fitted noise is not the declared; a missing effect may say so too."""
-        if self.interrupted in (LOOKING, FINER):
-            return []
-        tests = self.rounds[-1].screening.tests
-        return [tested for tested in tests.tested if tested.departure and tested.p_value <= tests.critical]
-
-    @property
-    def curve(self) -> Candidate | None:
-        """The curve that gains more than all effects; where the noise departs as well, it must be significant."""
-        best = next((curve for curve in self.curves if curve.is_judged), None)
-        if best is None or best.total <= self.gain + MIN_GAIN_OF_CURVE:
-            return None
-        tests = self.rounds[0].screening.tests
-        of_all = min(tested.p_value for tested in tests.tested if tested.is_curve)
-        return best if not self.departed or best.total > CLEAR_GAIN or of_all <= tests.critical else None
-
-    @property
-    def gain(self) -> float:
-        """Held-out log p(y) of the final program above the first, nats."""
-        return float((self.final.held_out - self.base.held_out[: len(self.final.held_out)]).sum())
 
 
 def search(problem: Problem, valid: Trajectories, settings: Settings) -> Search:
@@ -216,7 +112,8 @@ def search(problem: Problem, valid: Trajectories, settings: Settings) -> Search:
             assert found.asks is not None
             finer = found.asks.suited.substeps
             own = fit(with_substeps(program, finer), left, valid, with_substeps(found.as_it_stands.program, finer))
-            base, corrections = with_suitable_noise(own, settings.corrects, tails)
+            same = with_same_noise(own, found.base, found.corrections) if found.corrections else None
+            base, corrections = same or with_suitable_noise(own, settings.corrects, tails)
             there = replace(settings, declared=with_substeps(settings.declared, finer))
             fresh = Search(own, base, base, step, gained, outliers, corrections, found.asks)
             return _rounds(fresh, there, carried=found.found, looks_at_step=not is_last)
@@ -308,7 +205,7 @@ def _drop_corrections(found: Search, settings: Settings) -> None:
 
 def _add_all(found: Search, settings: Settings, carried: Sequence[Found], looks_at_step: bool) -> None:
     """Test, fit and add one effect after another; at first what is `carried`."""
-    near = {rival.variant.name for one in carried for rival in _rivals(one)}
+    near = {rival.variant.name for one in carried for rival in one.contenders}
     shares = [(said, 0.5**index) for index in range(MAX_ROUNDS) for said in ("testing every effect", "")]
     with stages(*shares) as begin_part:
         earlier = list(found.found)
@@ -339,20 +236,13 @@ def _carry(found: Search, carried: Sequence[Found]) -> None:
     """Add effects of another search that explain something and are needed beside the first one here, each or a rival
     that it had there."""
     for one in (one for one in carried if one.candidate.is_explanation):
-        there, rivals = {variant.name for variant in attached(found.final.program)}, _rivals(one)
+        there, rivals = {variant.name for variant in attached(found.final.program)}, one.contenders
         if found.is_full or one.candidate.variant.name in there:
             continue
         again = [_fitted_again(found.final, c) for c in rivals if c.variant.name not in there]
-        best, again = ParticleJudge(found.final).chosen(again, partial(_first, lambda c: c.total > TIE_NATS))
+        best, again = ParticleJudge(found.final).chosen(again, partial(first_enough, lambda c: c.total > TIE_NATS))
         if best is not None:
             _add(found, best, again)
-
-
-def _rivals(found: Found) -> list[Candidate]:
-    """An effect and what was nearly as good in its place."""
-    best = found.candidate
-    near = [c for c in found.rivals if c is not best and c.total > best.total - MAX_NATS_OF_RIVAL]
-    return [c for c in (best, *near) if isinstance(c.refit, Refit)]
 
 
 def _fitted_again(now: Refit, candidate: Candidate) -> Candidate:
@@ -367,12 +257,12 @@ def _look_again(found: Search, settings: Settings) -> None:
     """Prune, and test a program that has other effects then."""
     before, final = list(found.found), found.final
     prune(found)
-    if set(labels(found.final)) == set(labels(final)):  # the same in another order has been tested
+    if set(found.final.effects) == set(final.effects):  # the same in another order has been tested
         return
     try:
         found.rounds.append(Round(settings.screen(found.final, MAX_ROUNDS), [], None))
     except Exception as error:
-        new = [label for label in labels(found.final) if label not in labels(final)]
+        new = [label for label in found.final.effects if label not in final.effects]
         found.taken_back = dict.fromkeys(new, reason_of(error))
         found.found, found.final = before, final
 
@@ -400,11 +290,11 @@ def _add_best(found: Search, screening: Screening, index: int, near: Collection[
             if found.curve is not None:
                 break
         candidates += _refits(found.final, group, screening, found.rounds[-1].candidates)
-        best, candidates = _chosen(judge, candidates, partial(_first, is_enough))
+        best, candidates = _chosen(judge, candidates, partial(first_enough, is_enough))
         if best is not None:
             break
     if index == 0 and best is None and found.curve is None and not found.departed:  # neither is what the tests found
-        nearly = partial(_first, lambda c: c.total > TIE_NATS and c.tested.p_value <= NEAR_FAMILY_LEVEL)
+        nearly = partial(first_enough, lambda c: c.total > TIE_NATS and c.tested.p_value <= NEAR_FAMILY_LEVEL)
         best, candidates = judge.chosen(candidates, nearly)
     found.notes += curve.refused.values()
     found.rounds[-1] = Round(screening, candidates, best)
@@ -437,39 +327,10 @@ def _add(found: Search, best: Candidate, candidates: list[Candidate]) -> None:
         _place_again(found, one)
 
 
-def _first(is_enough: Callable[[Candidate], bool], ranked: Sequence[Candidate]) -> Candidate | None:
-    """The best candidate that brings enough, one that explains something before one that does not."""
-    able = sorted((c for c in ranked if c.is_judged and not c.against_its_sign), key=lambda c: not c.is_explanation)
-    return next((c for c in able if is_enough(c)), None)
-
-
 def _place_again(search: Search, found: Found) -> None:
     """Move the knee or place of an effect to where it is likeliest beside those that were added after it."""
-    final = _placed(search.base, search.final, found.candidate.variant)
-    search.found, search.final = _with_places_of(final, search.found), final
-
-
-def _placed(base: Refit, refit: Refit, variant: Variant) -> Refit:
-    """A fitted program with the knee or place of one of its effects, which `base` lacks, where it is likeliest."""
-    if not variant.profiled:
-        return refit
-    *_, (_, fits) = likelier_places(base, refit, variant)
-    if fits is refit or isinstance(moved := judged_fits(fits), str):
-        return refit
-    return moved
-
-
-def _with_places_of(final: Refit, found: Sequence[Found]) -> list[Found]:
-    """What was found, with the knees and places that the final program has."""
-    there = {variant.name: variant for variant in attached(final.program)}
-
-    def moved(one: Found) -> Found:
-        candidate, variant = one.candidate, there.get(one.candidate.variant.name)
-        if variant is None or variant.profiled == candidate.variant.profiled:
-            return one
-        return replace(one, candidate=replace(candidate, tested=candidate.tested.at(variant)))
-
-    return [moved(one) for one in found]
+    final = moved_to_likelier_place(search.base, search.final, found.candidate.variant)
+    search.found, search.final = with_places_of(final, search.found), final
 
 
 def _refits(now: Refit, chosen: Sequence[Tested], screening: Screening, candidates: list[Candidate]) -> list[Candidate]:
@@ -523,71 +384,3 @@ def _curves(search: Search) -> list[Candidate]:
     found = [judge.confirm(candidate) for candidate in fitted]
     # the simpler one, unless the other brings clearly more
     return sorted(found, key=lambda c: c.total - MIN_GAIN_OF_CURVE * multiplies(c), reverse=True)
-
-
-def labels(refit: Refit) -> list[str]:
-    """The effects of a program."""
-    return [variant.label for variant in attached(refit.program)]
-
-
-def prune(search: Search) -> None:
-    """Drop effects that are not needed beside the others, and let the rivals of each have its place."""
-    for name in [one.candidate.variant.name for one in search.found]:
-        found = next(one for one in search.found if one.candidate.variant.name == name)  # its place may have moved
-        without = _without(search, found)
-        if isinstance(without, str) or without is found.without:  # beside which it was chosen among the same rivals
-            continue
-        chosen, there = found.candidate, {variant.name for variant in attached(without.program)}
-        again, as_it_stands = [], judged(without, chosen.tested, search.final)
-        for rival in _rivals(found):
-            if rival.variant.name not in there and isinstance(rival.refit, Refit):
-                begin = rival.refit.coefficient(rival.variant)
-                refit = refit_with(without, rival.variant, begin, information=search.final.maxima[0])
-                one = judged(without, rival.tested, refit)
-                if one.total > as_it_stands.total - MAX_NATS_OF_RIVAL:  # else no knee or place brings it near
-                    one = at_its_best_place(without, one)
-                    for other in (other for other in search.found if other is not found):
-                        if isinstance(one.refit, Refit):
-                            placed = _placed(search.base, one.refit, other.candidate.variant)
-                            one = one if placed is one.refit else judged(without, one.tested, placed)
-                again.append(one)
-        if all(c.total < as_it_stands.total for c in again if c.variant.name == chosen.variant.name):
-            again = [as_it_stands, *(c for c in again if c.variant.name != chosen.variant.name)]
-        needed = partial(_first, lambda c: c.total > TIE_NATS)
-        best, again = ParticleJudge(without).chosen(again, needed)
-        if best is None or isinstance(best.refit, str):
-            search.found, search.final = [one for one in search.found if one is not found], without
-        else:
-            other = Found(best, again, without)
-            with_other = [other if one is found else one for one in search.found]
-            search.found, search.final = _with_places_of(best.refit, with_other), best.refit
-
-
-def _without(search: Search, found: Found) -> Refit | str:
-    """The program with the other effects, fitted one by one or from the fit of all, whichever is likelier: a fit that
-    has stopped early makes an effect look needed."""
-    others = [other.candidate for other in search.found if other is not found]
-    there = set(labels(found.without)) - set(labels(search.base))
-    begun = there <= {other.variant.label for other in others}
-    later = [other for other in others if other.variant.label not in there] if begun else others
-    afresh = _with_all(found.without if begun else search.base, later)
-    near = fit_near(search.base, search.final, [other.variant for other in others])
-    if isinstance(afresh, str) or isinstance(near, str):
-        return afresh if isinstance(near, str) else judged_fits(near)
-    most = max(_objective(search.final), _objective(afresh)) + MIN_NATS_OF_DIVERGENCE  # more: it has run away
-    likelier = judged_fits(near) if _objective(afresh) + SAME_MAXIMUM < _objective(near) < most else afresh
-    return afresh if isinstance(likelier, str) else likelier
-
-
-def _objective(fits: Fits) -> float:
-    return sum(maximum.objective for maximum in fits.maxima)
-
-
-def _with_all(base: Refit, candidates: Sequence[Candidate]) -> Refit | str:
-    now: Refit | str = base
-    for candidate in candidates:
-        if isinstance(now, str) or isinstance(candidate.refit, str):
-            return now
-        begin, known = candidate.refit.coefficient(candidate.variant), candidate.refit.maxima[0]
-        now = refit_with(now, candidate.variant, begin, information=known)
-    return now

@@ -14,11 +14,12 @@ from pyro.nn import PyroParam
 
 import steady_ppl as st
 from steady_ppl.discovery.candidates import Screening
-from steady_ppl.discovery.noise_first import needless, with_suitable_noise, without, without_outliers
+from steady_ppl.discovery.noise_first import needless, with_same_noise, with_suitable_noise, without, without_outliers
 from steady_ppl.discovery.refits import first_refit, refit_with
 from steady_ppl.effects import attached, chosen_variant
 from steady_ppl.likelihood.parameters import elements
 from steady_ppl.model.problem import Problem
+from steady_ppl.model.substeps import with_substeps
 
 SD = 0.05
 
@@ -79,6 +80,11 @@ def test_a_sensor_that_is_declared_wrong_is_corrected_and_no_other(program, fact
     assert float(base.coefficient(correction.variant)) == pytest.approx(factor, rel=0.1)
     assert [variant.name for variant in attached(base.program)] == ["measurement_noise:position"]
     assert with_suitable_noise(base, lambda variant: True) == (base, [])
+    fold, finer = own.folds[0], Problem(with_substeps(program(), 2), own.folds[0].drives, False)
+    same = with_same_noise(first_refit(finer, fold.held_out, seed=0), base, [correction])
+    assert same.corrections == [correction] and same.base.program.substeps == 2
+    assert float(same.base.coefficient(correction.variant)) == pytest.approx(factor, rel=0.1)
+    assert [variant.name for variant in attached(same.base.program)] == ["measurement_noise:position"]
 
 
 @pytest.mark.slow

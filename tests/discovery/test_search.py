@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from steady_ppl.discovery import search
+from steady_ppl.discovery import candidates, search, search_state
 from steady_ppl.discovery.candidates import MAX_NATS_BEHIND, leaders
 from steady_ppl.discovery.noise_first import Suited
 from steady_ppl.discovery.refits import Refit
@@ -138,7 +138,7 @@ def test_what_was_given_up_is_judged_after_all_where_it_is_ahead_of_what_a_filte
     monkeypatch.setattr(search, "refit_with", refit_with)
     monkeypatch.setattr(search, "judged", judge)
     monkeypatch.setattr(search.ParticleJudge, "confirm", confirm)
-    ranking = search.partial(search._first, lambda c: c.total > 2)
+    ranking = search.partial(search.first_enough, lambda c: c.total > 2)
     best, ranked = search._chosen(search.ParticleJudge("now"), [lever, limit], ranking)
     assert best.name == expected and best.total == max(20.0, total) and len(ranked) == 2
     assert asked == [("now", "lever", 3.5)] * (expected == "lever")
@@ -149,10 +149,10 @@ def test_a_knee_is_moved_beside_what_is_added_after_it(monkeypatch):
     knee.tested = SimpleNamespace(at=lambda variant: variant)
     final = SimpleNamespace(name="knee", profiled={"knee": 2.0})
     moved.refit.__dict__["programs"] = ["moved"]
-    monkeypatch.setattr(search, "attached", lambda program: [final] if program == "moved" else [])
-    monkeypatch.setattr(search, "replace", lambda one, **to: SimpleNamespace(**{**vars(one), **to}))
-    monkeypatch.setattr(search, "likelier_places", lambda base, begun, at: [(at, begun), (final, "fits")])
-    monkeypatch.setattr(search, "judged_fits", lambda fits: moved.refit)
+    monkeypatch.setattr(search_state, "attached", lambda program: [final] if program == "moved" else [])
+    monkeypatch.setattr(search_state, "replace", lambda one, **to: SimpleNamespace(**{**vars(one), **to}))
+    monkeypatch.setattr(candidates, "likelier_places", lambda base, begun, at: [(at, begun), (final, "fits")])
+    monkeypatch.setattr(candidates, "judged_fits", lambda fits: moved.refit)
     first = search.Found(knee, [knee], None)
     found = search.Search(None, base=None, final=later.refit, step=None, gained=0.0, found=[first])
     search._place_again(found, first)
