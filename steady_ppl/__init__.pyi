@@ -82,6 +82,7 @@ from .model.program import Program as Program, for_program as for_program
 from .model.substeps import with_substeps as with_substeps
 from .plotting.comparison import open_loop_picture as open_loop_picture
 from .reporting.report import Report as Report, report as report
+from .runs.diagnostics import doctor as doctor
 from .runs.export import Dynamics as Dynamics
 from .runs.fit import Fit as Fit
 from .smc.filter import particle_filter as particle_filter

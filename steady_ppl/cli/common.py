@@ -1,6 +1,7 @@
 """What the commands share: options, programs, runs and their labels, JSON, refusals of the system."""
 
 import errno
+import shlex
 from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any
@@ -10,7 +11,7 @@ import typer
 import steady_ppl as st
 from steady_ppl.errors import ComputationError, SteadyError, UsageError
 from steady_ppl.utils.files import finite_json, whole_file
-from steady_ppl.utils.text import shown, tell
+from steady_ppl.utils.text import say, shown, tell
 
 NO_SPACE = (errno.ENOSPC, errno.EFBIG, errno.EDQUOT)
 NO_MEMORY = ("can't allocate memory", "not enough memory", "out of memory", "Storage size calculation overflowed")
@@ -74,6 +75,17 @@ def program_from(model: str, seed: int, substeps: int | None = None) -> "st.Prog
         program = st.with_substeps(program, substeps)
     probe(program)
     return program
+
+
+def read_drives(table: Path, program: "st.Program", known: Collection[str] = ()) -> "st.Trajectories":
+    """The drives of a table; what is suspicious in it is said, but for the kinds that are `known` to be said later."""
+    from steady_ppl.runs.diagnostics import doctor
+
+    drives = st.read_table(table)
+    if found := [one for one in doctor(drives, program).findings if one.kind not in known]:
+        others = f"; {len(found) - 1} more" if len(found) > 1 else ""
+        say(f"{table.name}: {found[0]}{others} (`steady doctor {shlex.quote(str(table))}` says how to mend it)")
+    return drives
 
 
 def write_json(path: Path, content: Any) -> None:

@@ -1,4 +1,4 @@
-"""`steady check`, `prove`, `evaluate`, `states` and `report`: what runs say of drives."""
+"""`steady doctor`, `check`, `prove`, `evaluate`, `states` and `report`: what runs say of drives."""
 
 import os
 import shlex
@@ -9,13 +9,27 @@ import typer
 
 import steady_ppl as st
 from steady_ppl.cli import common
-from steady_ppl.cli.common import load_runs, present, program_from, run_labels, runs_and_table, used_before
+from steady_ppl.cli.common import load_runs, present, program_from, read_drives, run_labels, runs_and_table, used_before
 from steady_ppl.errors import UsageError
 from steady_ppl.utils.files import require_picture, require_place, write_picture
 from steady_ppl.utils.text import say, tell
 
+SAID_LATER = ("degrees", "frozen", "outlier")  # by `check` itself
 MIN_SHARE_OF_POOR_ROWS = 0.1  # share of the measured rows after which hardly a particle is left
 SIMULATIONS = 100  # sets for the bands of a report
+
+
+def doctor(
+    table: Annotated[Path, typer.Argument(help="Table, .csv or .parquet.")],
+    model: Annotated[str | None, typer.Argument(help="Program whose units and step are known.")] = None,
+    json_file: common.Json = None,
+) -> None:
+    """Say what is suspicious in a table, before anything is fitted, and the line that mends it."""
+    from steady_ppl.runs.diagnostics import doctor
+
+    require_place(json_file)
+    found = doctor(table, None if model is None else program_from(model, 0))
+    present(str(found), found.figures, json_file)
 
 
 def check(
@@ -44,8 +58,9 @@ def check(
         require_place(mask)
         if os.path.realpath(mask) in (os.path.realpath(table), json_file and os.path.realpath(json_file)):
             raise UsageError(f"--mask {mask} is the table itself, or the file of --json: name another file")
-    drives = st.read_table(table)
-    found = st.check(st.Fit.load(run, program), drives, simulations=simulations, seed=seed)
+    fit = st.Fit.load(run, program)
+    drives = read_drives(table, fit.program, SAID_LATER)
+    found = st.check(fit, drives, simulations=simulations, seed=seed)
     if picture is not None:
         from steady_ppl.plotting.check import check_picture
 
@@ -67,7 +82,10 @@ def prove(
     program: Annotated[list[str] | None, common.moved("once for each RUN and the oracle, in order")] = None,
     seed: common.Seed = 0,
 ) -> None:
-    """Prove that runs are better than the first one: log p(y), open-loop errors and noise, with paired intervals."""
+    """Prove that runs are better than the first one: log p(y), open-loop errors and noise, with paired intervals.
+
+    `steady evaluate RUN... TABLE` gives each run's errors alone, against true states where the table has them.
+    """
     from steady_ppl.runs.recipes import fingerprint
 
     runs, table = runs_and_table("prove", arguments)

@@ -8,13 +8,14 @@ import typer
 
 import steady_ppl as st
 from steady_ppl.cli import common
-from steady_ppl.cli.common import fit_or_program, present, program_from, write_json
+from steady_ppl.cli.common import fit_or_program, present, program_from, read_drives, write_json
 from steady_ppl.errors import RunError, UsageError
 from steady_ppl.utils.context import QUIET
 from steady_ppl.utils.files import require_picture, require_place, write_picture
 from steady_ppl.utils.text import say, shown, tell
 
 LITERALS = {"true": True, "false": False, "none": None}
+SAID_LATER = ("degrees",)  # by what learns, in its notes
 RECIPES = ("steady", "likelihood", "steady-minus", "svi", "hand", "fit-hand", "fit-tv", "fit-truth")
 GuideName = Literal["lookahead", "gaussian", "bootstrap", "network", "mean-field", "smoother"]
 
@@ -55,10 +56,11 @@ def fit(
     from steady_ppl.runs.recipes import run_recipe
 
     given = {"particles": particles, "draws": draws, "steps": steps, "hand": hand, "guide": guide}
+    program = program_from(model, seed, substeps)
     result = run_recipe(
         recipe,
-        program_from(model, seed, substeps),
-        st.read_table(table),
+        program,
+        read_drives(table, program, SAID_LATER),
         st.read_table(valid) if valid else None,
         out,
         options=_settings(setting or [], {name: value for name, value in given.items() if value is not None}),
@@ -142,7 +144,8 @@ def discover(
     require_picture(picture)
     require_place(json_file)
     given = fit_or_program(source, program, seed, substeps)
-    drives, judges = st.read_table(table), st.read_table(valid) if valid else None
+    drives = read_drives(table, given.program if isinstance(given, st.Fit) else given, (*SAID_LATER, "constant"))
+    judges = st.read_table(valid) if valid else None
     settings: dict[str, Any] = {"known_start": known_start, "mix": mix, "simulations": simulations, "seed": seed}
     settings |= {"withheld": withhold or [], "only": only or []}
     try:

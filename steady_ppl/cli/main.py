@@ -66,6 +66,12 @@ add_command(
     "steady simulate mine.py:Boat --controls drives.csv --out again.csv",
 )
 add_command(
+    judge.doctor,
+    "Say what is suspicious in a table.",
+    "steady doctor drives.csv",
+    "steady doctor drives.csv mine.py --json findings.json",
+)
+add_command(
     learn.fit,
     "Learn a program's parameters from measurements.",
     "steady fit mine.py train.csv --valid valid.csv --recipe likelihood --out runs/first",
@@ -99,6 +105,7 @@ add_command(
     judge.evaluate,
     "Errors of runs, against true states where they exist.",
     "steady evaluate runs/first runs/svi test.csv --json errors.json",
+    hidden=True,
 )
 add_command(
     judge.report,

@@ -12,7 +12,10 @@ import re
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
+import numpy as np
 import pandas as pd
+import pyarrow
+import pyarrow.csv as arrow_csv
 
 from steady_ppl.errors import DataError
 from steady_ppl.utils.text import shown
@@ -23,11 +26,11 @@ DECIMAL_COMMA = re.compile(r"\s*[+-]?\d*,\d+([eE][+-]?\d+)?\s*")
 EVERY_TABLE = {"trajectory", "time"}  # columns by which a header is known
 
 
-def read_csv(path: Path, units_row: bool = False) -> tuple[pd.DataFrame, list[str]]:
-    """The cells of a file as text, under its column names, and what was harmless, in words.
+def read_csv(path: Path, units_row: bool | None = False) -> tuple[pd.DataFrame, list[str]]:
+    """The cells of a file, as numbers where all are and else as text, under its column names; and what was harmless.
 
     Args:
-        units_row: the row below the header has units, and is left out.
+        units_row: the row below the header has units, and is left out; None: if it looks like one.
 
     Raises:
         DataError: rows of several lengths, or a row of units where none was announced, or none where one was.
@@ -36,6 +39,8 @@ def read_csv(path: Path, units_row: bool = False) -> tuple[pd.DataFrame, list[st
     told = list[str]()
     lines = _without_comments(_text(path.read_bytes(), told), told)
     separator = _separator(lines)
+    if separator == "," and not units_row and (plain := _plain(lines)) is not None:
+        return plain, told
     # not pandas' reader: it fills up a row that was cut short and renames a column that appears twice
     cells = [row for row in csv.reader(io.StringIO(lines, newline=""), delimiter=separator, strict=True) if row]
     if not cells:
@@ -56,6 +61,29 @@ def read_csv(path: Path, units_row: bool = False) -> tuple[pd.DataFrame, list[st
         rows = [_with_points(header, row) for row in rows]
         told.append("decimal commas")
     return pd.DataFrame(rows, columns=header, dtype=object), told
+
+
+def _plain(text: str) -> pd.DataFrame | None:
+    """A table of labels and finite numbers alone by Arrow's reader, which is twenty times as fast and rounds numbers as
+    Python does; None where it may be more than that."""
+    header = text.partition("\n")[0].rstrip("\r")
+    names = header.split(",")
+    is_usual = len(set(names)) == len(names) and all(name and name == name.strip() for name in names)
+    if not is_usual or "trajectory" not in names or '"' in text or "\0" in text:
+        return None
+    types = {name: pyarrow.string() if name == "trajectory" else pyarrow.float64() for name in names}
+    try:
+        table = arrow_csv.read_csv(
+            pyarrow.BufferReader(text.encode()),
+            arrow_csv.ReadOptions(use_threads=False),
+            arrow_csv.ParseOptions(quote_char=False, ignore_empty_lines=True),
+            arrow_csv.ConvertOptions(column_types=types, null_values=["", "nan", "NaN"], strings_can_be_null=False),
+        )
+    except pyarrow.ArrowException:
+        return None
+    frame = table.to_pandas()
+    numbers = [frame[name].to_numpy() for name in names if name != "trajectory"]
+    return None if any(np.isinf(values).any() for values in numbers) else frame.astype({"trajectory": object})
 
 
 def _text(content: bytes, told: list[str]) -> str:
@@ -97,7 +125,7 @@ def _without_last_separator(
 
 
 def _without_units(
-    name: str, header: Sequence[str], rows: list[list[str]], announced: bool, told: list[str]
+    name: str, header: Sequence[str], rows: list[list[str]], announced: bool | None, told: list[str]
 ) -> list[list[str]]:
     units = [cell.strip() for cell in rows[0]] if rows else []
     is_row_of_units = len(rows) > 1 and _is_text(header, units) and not _is_text(header, rows[1])
@@ -106,7 +134,7 @@ def _without_units(
             raise DataError(f"{name}: row 1 has no units: leave --units-row (units_row=True) out", row=1)
         return rows
     said = shown(", ".join(units), 100)
-    if not announced:
+    if announced is False:
         what = f"it looks like a row of units ({said}): read the table with --units-row (units_row=True)"
         raise DataError(f"{name}: row 1: {what}", row=1)
     told.append(f"a row of units ({said})")

@@ -45,19 +45,27 @@ def read_table(path: str | Path, *, units_row: bool | None = None) -> Trajectori
         DataError: naming the file and, where they apply, the column, the trajectory and the row.
     """
     path = Path(path)
+    frame, told = read_cells(path, UNITS_ROW.get() if units_row is None else units_row)
+    data = from_frame(frame, name=path.name)
+    if told:
+        warnings.warn(f"{path.name}: read with {', '.join(told)}", TableWarning, stacklevel=2)
+    return data
+
+
+def read_cells(path: Path, units_row: bool | None) -> tuple[pd.DataFrame, list[str]]:
+    """The cells of a `.csv` or `.parquet` file, and how a CSV was written, see `read_table`.
+
+    Args:
+        units_row: the row below the header of a CSV has units; None: if it looks like one.
+    """
     require_file(path, DataError)
     try:
-        announced = UNITS_ROW.get() if units_row is None else units_row
-        frame, told = read_csv(path, announced) if _suffix(path) == ".csv" else (_read_parquet(path), [])
+        return read_csv(path, units_row) if _suffix(path) == ".csv" else (_read_parquet(path), [])
     except FileNotFoundError as error:
         raise DataError(f"{path.name}: there is no such file") from error
     except (OSError, ValueError, csv.Error, pyarrow.ArrowException) as error:
         reason = getattr(error, "strerror", None) or str(error).partition("\n")[0]
         raise DataError(f"{path.name}: cannot be read as {_suffix(path)[1:]}: {reason}") from error
-    data = from_frame(frame, name=path.name)
-    if told:
-        warnings.warn(f"{path.name}: read with {', '.join(told)}", TableWarning, stacklevel=2)
-    return data
 
 
 def write_table(data: Trajectories, path: str | Path) -> None:
@@ -174,8 +182,10 @@ def _trajectories(cells: pd.Series, name: str) -> tuple[np.ndarray, np.ndarray]:
     if len(cells) == 0:
         fail(name, "the table has no rows")
     whole = pd.api.types.is_float_dtype(cells.dtype) and bool((cells.dropna() % 1 == 0).all())  # numbers with a gap
-    labels = np.array([f"{cell:.0f}" if whole else str(cell) for cell in cells], dtype=object)
-    empty = cells.isna().to_numpy() | np.array([not label.strip() for label in labels])
+    codes, different = pd.factorize(cells, use_na_sentinel=False)
+    named = np.array([f"{cell:.0f}" if whole else str(cell) for cell in different], dtype=object)
+    is_empty = pd.isna(different) | np.array([not label.strip() for label in named], dtype=bool)
+    labels, empty = named[codes], is_empty[codes]
     if empty.any():
         fail(name, "got an empty cell, expected a label", column="trajectory", row=int(empty.argmax()) + 1)
     starts = np.flatnonzero(np.append(True, labels[1:] != labels[:-1]))
@@ -194,7 +204,7 @@ def finite_numbers(
     cells: pd.Series, name: str, required: np.ndarray, trajectories: np.ndarray | None = None
 ) -> np.ndarray:
     """A column as float64, NaN for an empty cell that is not `required`; any other cell is a DataError."""
-    values, bad = _parse_cells(cells)
+    values, bad = parse_cells(cells)
     bad = bad | np.isinf(values) | (np.isnan(values) & required)
     for row in np.flatnonzero(bad)[:1].tolist():
         wanted = "a finite number" if required[row] else "a finite number or an empty cell"
@@ -205,11 +215,13 @@ def finite_numbers(
     return values
 
 
-def _parse_cells(cells: pd.Series) -> tuple[np.ndarray, np.ndarray]:
+def parse_cells(cells: pd.Series) -> tuple[np.ndarray, np.ndarray]:
     """The cells as float64, NaN where empty, and where they are not numbers."""
     bad = np.zeros(len(cells), dtype=bool)
     if pd.api.types.is_float_dtype(cells.dtype) or pd.api.types.is_integer_dtype(cells.dtype):
         return cells.to_numpy(dtype=np.float64, na_value=np.nan, copy=True), bad
+    if (numbers := _parse_numbers(cells)) is not None:
+        return numbers, bad
     values = np.full(len(cells), np.nan)
     for i, cell in enumerate(cells.where(cells.notna(), "")):
         text = str(cell).strip()
@@ -219,6 +231,17 @@ def _parse_cells(cells: pd.Series) -> tuple[np.ndarray, np.ndarray]:
             bad[i] = True
         bad[i] |= "_" in text or not text.isascii()  # float() takes separators, and digits of other scripts
     return values, bad
+
+
+def _parse_numbers(cells: pd.Series) -> np.ndarray | None:
+    """Text cells as float64 where all are empty or plain numbers; None where some may be something else."""
+    text = cells.to_numpy(dtype=object)
+    if not all(type(cell) is str for cell in text) or "_" in (whole := "".join(text)) or not whole.isascii():
+        return None
+    try:
+        return np.where(text == "", "nan", text).astype(np.float64)
+    except ValueError:
+        return None
 
 
 def _read_parquet(path: Path) -> pd.DataFrame:

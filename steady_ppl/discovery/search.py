@@ -52,7 +52,6 @@ MAX_SHIFT_OF_SIZES = 0.08  # nats by which twice the substeps may move what is r
 MAX_SUBSTEPS_OF_FIT = 128  # of a fitted program, at most: what a coarser step leaves would be named as an effect
 MAX_CURVES = 3  # adding curves that are fitted
 MAX_ROUNDS = MAX_EFFECTS + 3  # with factors on noise, which take no place, and a last test
-MAX_FINER_SEARCHES = 2  # that begin again at a step for which what was found asks
 NOT_FINER = "what was found was not looked at in finer time steps: {}"
 NOTHING_TESTED = "the program as it stands was fitted, and no effect has been tested yet"
 
@@ -107,32 +106,24 @@ def search(problem: Problem, valid: Trajectories, settings: Settings) -> Search:
         begin()
         found = _rounds(Search(own, base, base, step, gained, outliers, corrections), settings)
 
-        def at_finer_step(found: Search, is_last: bool) -> Search:
-            """The search again at the step for which what was found asks: sizes are those of that step."""
-            assert found.asks is not None
-            finer = found.asks.suited.substeps
-            own = fit(with_substeps(program, finer), left, valid, with_substeps(found.as_it_stands.program, finer))
-            same = with_same_noise(own, found.base, found.corrections) if found.corrections else None
+        if found.asks is None or found.interrupted:
+            return found
+        finer = found.asks.suited.substeps  # sizes are those of that step
+        try:
+            own = fit(with_substeps(program, finer), left, valid, with_substeps(own.program, finer))
+            same = with_same_noise(own, base, corrections) if corrections else None
             base, corrections = same or with_suitable_noise(own, settings.corrects, tails)
             there = replace(settings, declared=with_substeps(settings.declared, finer))
             fresh = Search(own, base, base, step, gained, outliers, corrections, found.asks)
-            return _rounds(fresh, there, carried=found.found, looks_at_step=not is_last)
-
-        for index in range(MAX_FINER_SEARCHES):
-            if found.asks is None or found.interrupted:
-                break
-            try:
-                again = at_finer_step(found, index == MAX_FINER_SEARCHES - 1)
-                if again.interrupted and len(again.found) < len(found.found):
-                    found.interrupt(FINER)
-                else:
-                    found = again
-            except KeyboardInterrupt:
-                found.interrupt(FINER)
-            except Exception as error:  # also of the program's own code, in steps that nobody tried before
-                fresh = Search(own, base, base, step, gained, outliers, corrections)
-                found = _rounds(fresh, settings, looks_at_step=False)
-                found.notes.append(NOT_FINER.format(reason_of(error)))
+            again = _rounds(fresh, there, carried=found.found, looks_at_step=False)
+            if not again.interrupted:
+                return again
+            found.interrupt(FINER)
+        except KeyboardInterrupt:
+            found.interrupt(FINER)
+        except Exception as error:  # also of the program's own code, in steps that nobody tried before
+            found.notes.append(NOT_FINER.format(reason_of(error)))
+            _end(found, settings)
     return found
 
 
@@ -143,9 +134,8 @@ def _step_of(refit: Refit, **watched: Any) -> StepCheck:
 
 
 def _look_at_step(found: Search) -> None:
-    """Compare time steps beside what was found, unless they were compared beside the same effects."""
-    there = [variant.name for variant in attached(found.final.program)]
-    if not found.found or found.compared == there:
+    """Compare time steps beside what was found."""
+    if not found.found:
         return
     try:
         parameters = [variant.parameter for variant in attached(found.final.program)]
@@ -153,39 +143,47 @@ def _look_at_step(found: Search) -> None:
         found.asks = check if check.too_coarse else None
     except Exception as error:  # also of the program's own code, in steps that nobody tried before
         found.notes.append(NOT_FINER.format(reason_of(error)))
-    found.compared = there
 
 
 def _rounds(found: Search, settings: Settings, carried: Sequence[Found] = (), *, looks_at_step: bool = True) -> Search:
     """Test, fit and add until nothing is left, or until an interrupt (Ctrl-C) after the first tests.
 
     What was found at a coarser step and is `carried` is added after the first round, as far as it is needed. Where it
-    `looks_at_step`, it ends as soon as what was found `asks` for a finer one.
+    `looks_at_step`, it ends before curves if what was found `asks` for a finer one.
     """
-    with stages(("", 6), ("looking again", 1), ("fitting curves", 1)) as begin:
+    with stages(("", 6), ("looking again", 1), ("", 1)) as begin:
         doing = LOOKING
         try:
             begin()
-            _add_all(found, settings, carried, looks_at_step)
+            _add_all(found, settings, carried)
             doing = "looking again at what was found"
             begin()
-            if found.asks is None and len(found.found) > 1:
+            if len(found.found) > 1:
                 _look_again(found, settings)
-                if looks_at_step:
-                    _look_at_step(found)
-            doing = "fitting curves"
-            begin()
-            if found.asks is not None:
-                return found
-            if found.found and not found.curves and (len(found.found) > 1 or not found.rounds[1].nothing_found):
-                found.curves = _curves(found)
-            if found.found:
-                _drop_corrections(found, settings)
+            doing = FINER
+            if looks_at_step:
+                _look_at_step(found)
         except KeyboardInterrupt as stop:
             if not found.rounds:
                 raise KeyboardInterrupt(NOTHING_TESTED) from stop
             found.interrupt(doing)
+        begin()
+        if found.asks is None and not found.interrupted:
+            _end(found, settings)
     return found
+
+
+def _end(found: Search, settings: Settings) -> None:
+    """Fit curves beside what was found, and take corrections back that it makes needless, until an interrupt."""
+    with stages(("fitting curves", 1)) as begin:
+        try:
+            begin()
+            if found.found and not found.curves and (len(found.found) > 1 or not found.rounds[1].nothing_found):
+                found.curves = _curves(found)
+            if found.found:
+                _drop_corrections(found, settings)
+        except KeyboardInterrupt:
+            found.interrupt("fitting curves")
 
 
 def _drop_corrections(found: Search, settings: Settings) -> None:
@@ -203,7 +201,7 @@ def _drop_corrections(found: Search, settings: Settings) -> None:
     found.rounds, found.final, found.corrections = [*found.rounds, last], final, kept
 
 
-def _add_all(found: Search, settings: Settings, carried: Sequence[Found], looks_at_step: bool) -> None:
+def _add_all(found: Search, settings: Settings, carried: Sequence[Found]) -> None:
     """Test, fit and add one effect after another; at first what is `carried`."""
     near = {rival.variant.name for one in carried for rival in one.contenders}
     shares = [(said, 0.5**index) for index in range(MAX_ROUNDS) for said in ("testing every effect", "")]
@@ -226,10 +224,6 @@ def _add_all(found: Search, settings: Settings, carried: Sequence[Found], looks_
                 break
             if index == 0:
                 _carry(found, carried)
-            if looks_at_step:
-                _look_at_step(found)
-            if found.asks is not None:
-                break
 
 
 def _carry(found: Search, carried: Sequence[Found]) -> None:

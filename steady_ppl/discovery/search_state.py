@@ -80,7 +80,6 @@ class Search:
     notes: list[str] = field(default_factory=list)  # what could not be done
     interrupted: str = ""  # what was being done when an interrupt (Ctrl-C) came; empty as a rule
     cut_short: bool = False  # whether the interrupt came before the search had ended
-    compared: list[str] = field(default_factory=list)  # the effects beside which steps were last compared
 
     def interrupt(self, doing: str, *, cut_short: bool = True) -> None:
         """End with what has been found so far."""

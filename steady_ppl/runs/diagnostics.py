@@ -2,10 +2,12 @@
 
 import math
 from collections.abc import Mapping
+from pathlib import Path
 
 from pyro.distributions import constraints
 from torch import Tensor
 
+from steady_ppl.data.doctor import Examination, examine
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.model.program import Program, parameter_name
 from steady_ppl.runs.fit import Fit
@@ -46,6 +48,29 @@ def diagnose_fit(fit: Fit, declared: Mapping[str, Tensor]) -> list[str]:
                 label = f"{short}[{index}]" if before.numel() > 1 else short
                 found.append(f"{label} fell from {math.exp(then):.3g} to {math.exp(value):.2g}: {why}")
     return found
+
+
+def doctor(table: str | Path | Trajectories, program: Program | None = None) -> Examination:
+    """What is suspicious in a table, before anything is fitted, and the line that mends it.
+
+    Looked for are codes for missing values, degrees, headings that count otherwise, swapped axes, times that are no
+    seconds, dates, text, frozen and interpolated stretches, outliers, constant and copied columns, gaps, and
+    trajectories of one row, in several places or that overlap.
+
+    Args:
+        table: a `.csv` or `.parquet` file, or what `read_table` returned.
+        program: whose units and step are known; without it the names of columns say what is an angle.
+
+    Raises:
+        DataError: the file cannot be read, or has no trajectory or time.
+    """
+    if program is None:
+        return examine(table)
+    angles = {f"x.{name}": "rad" if name in program.angles else "" for name in program.state_names}
+    seen = zip(program.measurement_names, program.measurement_units, strict=True)
+    given = zip(program.control_names, program.control_units, strict=True)
+    units = {f"y.{name}": unit for name, unit in seen} | {f"u.{name}": unit for name, unit in given} | angles
+    return examine(table, units, program.step)
 
 
 def diagnose_units(program: Program, data: Trajectories) -> list[str]:

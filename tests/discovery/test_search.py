@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from types import SimpleNamespace
 
 import pytest
@@ -277,67 +276,59 @@ def test_a_search_begins_again_at_the_step_for_which_what_was_found_asks(asking)
     finer = search.Search(None, None, None, None, 0.0)
     found, asked = come_to(coarse, finer)
     assert found is finer
-    assert asked == [(None, [], True, None), ("4 substeps", ["drag"], True, coarse.asks)]
+    assert asked == [(None, [], True, None), ("4 substeps", ["drag"], False, coarse.asks)]
 
 
-def test_the_second_search_at_a_finer_step_is_the_last(asking):
+def test_where_finer_time_steps_fail_the_search_ends_at_its_own_step(asking, monkeypatch):
     coarse, come_to = asking
-    finest = replace(coarse)
-    found, asked = come_to(coarse, coarse, finest)
-    assert found is finest and [looks for *_, looks, _ in asked] == [True, True, False]
-
-
-def test_where_finer_time_steps_fail_the_search_ends_at_its_own_step(asking):
-    coarse, come_to = asking
-    whole = replace(coarse, asks=None, notes=[])
-    found, asked = come_to(coarse, RuntimeError("the tide is out"), whole)
-    assert found is whole and asked[-1] == (None, [], False, None)
+    ended = []
+    monkeypatch.setattr(search, "_end", lambda found, settings: ended.append(found))
+    found, _ = come_to(coarse, RuntimeError("the tide is out"))
+    assert found is coarse and ended == [coarse] and found.is_complete
     assert found.notes == ["what was found was not looked at in finer time steps: RuntimeError: the tide is out"]
-    assert found.is_complete
 
 
-@pytest.mark.parametrize("is_ahead", [True, False])
-def test_an_interrupt_at_a_finer_time_step_leaves_the_search_that_has_found_more(asking, is_ahead):
+def test_an_interrupt_at_a_finer_time_step_leaves_the_coarser_search(asking):
     coarse, come_to = asking
-    again = search.Search(None, None, None, None, 0.0, found=coarse.found if is_ahead else [])
+    again = search.Search(None, None, None, None, 0.0)
     again.interrupt(search.LOOKING)
-    found, _ = come_to(coarse, again)
-    assert found is (again if is_ahead else coarse)
-    assert found.interrupted == (search.LOOKING if is_ahead else search.FINER)
+    for outcome in (again, KeyboardInterrupt(search.NOTHING_TESTED)):
+        found, _ = come_to(coarse, outcome)
+        assert found is coarse and found.interrupted == search.FINER and not found.is_complete and not found.departed
 
 
-def test_an_interrupt_before_the_first_tests_at_a_finer_time_step_leaves_the_coarser_search(asking):
-    coarse, come_to = asking
-    found, _ = come_to(coarse, KeyboardInterrupt(search.NOTHING_TESTED))
-    assert found is coarse and found.interrupted == search.FINER and not found.is_complete and not found.departed
-
-
-@pytest.mark.parametrize("fails", [False, True])
-def test_time_steps_are_compared_once_beside_the_same_effects(monkeypatch, fails):
+@pytest.mark.parametrize("outcome", [RuntimeError("the tide is out"), True, False])
+def test_what_was_found_is_looked_at_in_finer_time_steps(monkeypatch, outcome):
     looked = []
 
     def step_of(refit, **watched):
         looked.append(watched["watched"])
-        if fails:
-            raise RuntimeError("the tide is out")
-        return SimpleNamespace(too_coarse=len(looked) > 1)
+        if isinstance(outcome, Exception):
+            raise outcome
+        return SimpleNamespace(too_coarse=outcome)
 
     monkeypatch.setattr(search, "_step_of", step_of)
     monkeypatch.setattr(search, "attached", lambda program: program)
-    drag, lag = (SimpleNamespace(name=name, parameter=name) for name in ("drag", "lag"))
-    found = search.Search(None, None, SimpleNamespace(program=[drag]), None, 0.0)
+    found = search.Search(None, None, SimpleNamespace(program=[SimpleNamespace(parameter="drag")]), None, 0.0)
     search._look_at_step(found)
     assert not looked  # nothing was found
     found.found = [Found(Chosen("drag", 9.0), [], None)]
-    for _ in range(2):
-        search._look_at_step(found)
-    assert looked == [["drag"]] and found.asks is None
-    found.final = SimpleNamespace(program=[drag, lag])
     search._look_at_step(found)
-    assert looked == [["drag"], ["drag", "lag"]] and (found.asks is None) == fails
-    assert found.notes == 2 * fails * [
-        "what was found was not looked at in finer time steps: RuntimeError: the tide is out"
-    ]
+    assert looked == [["drag"]] and (found.asks is not None) == (outcome is True)
+    is_failed = isinstance(outcome, Exception)
+    assert found.notes == is_failed * [search.NOT_FINER.format("RuntimeError: the tide is out")]
+
+
+@pytest.mark.parametrize("asks", [True, False])
+def test_curves_are_fitted_at_the_last_step_alone(monkeypatch, asks):
+    found, done = search.Search(None, None, None, None, 0.0), []
+    monkeypatch.setattr(search, "_add_all", lambda *_: done.append("add"))
+    monkeypatch.setattr(search, "_look_at_step", lambda found: setattr(found, "asks", "step" if asks else None))
+    monkeypatch.setattr(search, "_end", lambda *_: done.append("end"))
+    assert search._rounds(found, None) is found
+    assert done == ["add", *([] if asks else ["end"])]
+    done.clear()
+    assert search._rounds(search.Search(None, None, None, None, 0.0), None, looks_at_step=False) and len(done) == 2
 
 
 @pytest.mark.parametrize(
@@ -386,7 +377,7 @@ def test_without_tests_of_what_was_carried_the_search_at_a_finer_step_fails(monk
     found = search.Search(None, "base", "base", None, 0.0)
     if carried:
         with pytest.raises(RuntimeError, match="tide"):
-            search._add_all(found, search.Settings(declared=None), carried, False)
+            search._add_all(found, search.Settings(declared=None), carried)
     else:
-        search._add_all(found, search.Settings(declared=None), carried, False)
+        search._add_all(found, search.Settings(declared=None), carried)
         assert found.taken_back == {"drag": "RuntimeError: the tide is out"} and found.final == "base"
