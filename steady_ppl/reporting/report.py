@@ -1,4 +1,4 @@
-"""One page of HTML about runs: a check of each, a proof of two or more, and what `discover` found."""
+"""One page of HTML about runs: the table, a check of each, a proof of two or more, and what `discover` found."""
 
 import html
 import inspect
@@ -19,11 +19,13 @@ from steady_ppl.comparison.prove import prove, unconverged
 from steady_ppl.comparison.result import Proof
 from steady_ppl.criticism.check import check
 from steady_ppl.criticism.result import Check, strongest
+from steady_ppl.data.doctor import Examination
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.effects import Effect, attached, written_class
 from steady_ppl.errors import SteadyError, UsageError
 from steady_ppl.model.program import parameter_rows
 from steady_ppl.reporting.drives import Shown, chosen_drives, common_data, data_of_run, where_to_look
+from steady_ppl.runs.diagnostics import doctor
 from steady_ppl.runs.fit import Fit, versions
 from steady_ppl.utils.cores import one_thread
 from steady_ppl.utils.files import finite_json, whole_file
@@ -38,6 +40,7 @@ class Report:
 
     Attributes:
         title: of the page.
+        table: what is suspicious in the table.
         fits, checks: by the runs' labels.
         proof: of the runs against the first one, or why there is none.
         discovery: the figures of `discover`, if there are any.
@@ -48,6 +51,7 @@ class Report:
     """
 
     title: str
+    table: Examination
     fits: Mapping[str, Fit]
     checks: Mapping[str, Check]
     proof: Proof | str
@@ -74,6 +78,7 @@ class Report:
         discovery = {name: self.discovery[name] for name in drawn} if self.discovery else None
         content = {
             "title": self.title,
+            "table": self.table,
             "notes": self.notes,
             "checks": figures,
             "strongest": {label: _linked(one["findings"], self, label) for label, one in figures.items()},
@@ -234,6 +239,7 @@ def report(
     """
     if not runs:
         raise UsageError("a report needs at least one run")
+    table = doctor(data, next(iter(runs.values())).program)
     plan = [(f"checking {label}", 4) for label in runs] + [(f"drawing {label}", 1) for label in runs]
     with stages(*plan, ("comparing", len(runs))) as begin:
         checks = {}
@@ -255,6 +261,7 @@ def report(
                 proof = f"The runs cannot be compared: {error}."
     return Report(
         title=title,
+        table=table,
         fits=dict(runs),
         checks=checks,
         proof=proof,

@@ -62,7 +62,7 @@ def test_names_of_a_table_or_a_program_are_no_page(page):
 def test_every_label_of_a_section_a_select_and_a_table_is_there(page):
     elements = Elements(page.read_text())
     sections = [attributes for tag, attributes in elements.tags if tag == "section"]
-    assert len(sections) == 7 and {s["aria-labelledby"] for s in sections} <= set(elements.of("id"))
+    assert len(sections) == 8 and {s["aria-labelledby"] for s in sections} <= set(elements.of("id"))
     assert {"#verdict", "#drives", "#where", "#missing", "#gain", "#program", "#again"} <= set(elements.of("href"))
     assert all("scope" in attributes for tag, attributes in elements.tags if tag == "th")
     assert ("html", {"lang": "en"}) in elements.tags
