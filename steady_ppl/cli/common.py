@@ -3,13 +3,14 @@
 import errno
 import shlex
 from collections.abc import Collection, Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
 import steady_ppl as st
-from steady_ppl.errors import ComputationError, SteadyError, UsageError
+from steady_ppl.errors import ComputationError, DataError, SteadyError, UsageError
 from steady_ppl.utils.files import finite_json, whole_file
 from steady_ppl.utils.text import say, shown, tell
 
@@ -81,10 +82,18 @@ def read_drives(table: Path, program: "st.Program", known: Collection[str] = ())
     """The drives of a table; what is suspicious in it is said, but for the kinds that are `known` to be said later."""
     from steady_ppl.runs.diagnostics import doctor
 
-    drives = st.read_table(table)
+    hint = f"(`steady doctor {shlex.quote(str(table))}` says how to mend it)"
+    try:
+        drives = st.read_table(table)
+    except DataError:
+        with suppress(SteadyError):  # it cannot be examined either
+            kinds = [one.kind for one in doctor(table, program).findings if one.kind not in ("refused", "units row")]
+            if kinds:
+                say(f"{table.name}: suspicious are {', '.join(dict.fromkeys(kinds))} {hint}")
+        raise
     if found := [one for one in doctor(drives, program).findings if one.kind not in known]:
         others = f"; {len(found) - 1} more" if len(found) > 1 else ""
-        say(f"{table.name}: {found[0]}{others} (`steady doctor {shlex.quote(str(table))}` says how to mend it)")
+        say(f"{table.name}: {found[0]}{others} {hint}")
     return drives
 
 

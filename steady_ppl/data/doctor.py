@@ -13,12 +13,20 @@ import numpy as np
 import pandas as pd
 
 from steady_ppl.data.frozen_sensors import frozen_stretches
-from steady_ppl.data.suspicions import LOOKS, Array, Columns, Suspicion
+from steady_ppl.data.suspicions import LOOKS, Array, Columns, Suspicion, cell, counted
 from steady_ppl.data.table import from_frame, parse_cells, read_cells, to_frame
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.errors import DataError
 from steady_ppl.utils.context import UNITS_ROW, Displayed
 from steady_ppl.utils.text import shown
+
+OF_DATES = (
+    'table["time"] = (pd.to_datetime(table["time"], utc=True, format="ISO8601") - pd.Timestamp(0, tz="UTC")) '
+    "/ pd.Timedelta(seconds=1)"
+)
+REFUSED = ("one row", "apart", "time", "text", "dates", "infinite", "units row")  # kinds that the reader refuses
+FEW_VALUES = 0.1  # of a column's cells, so few different values: it counts steps, or is coarse
+MAX_SHOWN = 6  # findings on one screen
 
 
 @dataclass(frozen=True)
@@ -34,14 +42,41 @@ class Examination(Displayed):
     def __str__(self) -> str:
         count = len(self.findings)
         found = "nothing is suspicious" if not count else f"{count} finding{'s' if count > 1 else ''}"
-        lines = [f"{self.name}: {self.trajectories} trajectories, {self.rows} rows; {found}."]
+        drives = "1 trajectory" if self.trajectories == 1 else f"{self.trajectories} trajectories"
+        lines = [f"{self.name}: {drives}, {counted(self.rows, 'row')}; {found}."]
         lines += [f"Read with {', '.join(self.dialect)}."] if self.dialect else []
-        for number, one in enumerate(self.findings, 1):
+        for number, one in enumerate(self.findings[:MAX_SHOWN], 1):
             lines += ["", f"{number}. {one}", f"   {one.mend}"]
+        if count > MAX_SHOWN:
+            rest = (f"{one.kind} ({one.column})" if one.column else one.kind for one in self.findings[MAX_SHOWN:])
+            told = shown(", ".join(dict.fromkeys(rest)), 200)
+            lines += ["", f"And {count - MAX_SHOWN} more (--json has them all): {told}"]
         if any(one.mend.startswith("table") for one in self.findings):
-            read = "table = pd.read_parquet" if self.name.endswith(".parquet") else "table = pd.read_csv"
-            lines += ["", f"The lines that begin with “table” are for pandas: {read}({self.name!r}) first."]
+            lines += ["", "Lines that begin with “table” are for pandas, between these two:", f"   {self.reading}"]
+            lines += ['   table.to_csv("mended.csv", index=False)']
         return "\n".join(lines)
+
+    @property
+    def reading(self) -> str:
+        """The line that reads the table with pandas, its labels as they are."""
+        if self.name.endswith(".parquet"):
+            return f"import numpy as np, pandas as pd; table = pd.read_parquet({self.name!r})"
+        if not self.name.endswith(".csv"):
+            return "import numpy as np, pandas as pd"
+        told = " ".join(self.dialect)
+        comments = int(told.split(" comment line")[0].split()[-1]) if " comment line" in told else 0
+        skipped = [*range(comments), *([comments + 1] if "a row of units" in told else [])]
+        given = {
+            "sep": ";" if "semicolons" in told else "\t" if "tabs" in told else "",
+            "decimal": "," if "decimal commas" in told else "",
+            "encoding": "utf-16" if "UTF-16" in told else "",
+            "skiprows": skipped,
+            "index_col": False if "a separator at the end" in told else None,
+        }
+        more = "".join(f", {name}={value!r}" for name, value in given.items() if value not in ("", [], None))
+        labels = "dtype={'trajectory': str}, keep_default_na=False, na_values=['', 'nan', 'NaN']"
+        names = ".rename(columns=str.strip)" if "blanks around" in told else ""
+        return f"import numpy as np, pandas as pd; table = pd.read_csv({self.name!r}, {labels}{more}){names}"
 
     @property
     def figures(self) -> dict[str, object]:
@@ -84,11 +119,15 @@ def examine(
         name = Path(table).name
         frame, dialect = read_cells(Path(table), UNITS_ROW.get() or None)
     numbers, findings = _numbers(frame, name, units or {}, step)
-    is_whole = not findings
     for look in LOOKS:
         findings += look(numbers)
-    if is_whole and not any(one.kind in ("one row", "apart", "time") for one in findings):
-        findings += _frozen(table if isinstance(table, Trajectories) else from_frame(frame, name))
+    try:
+        findings += _frozen(table if isinstance(table, Trajectories) else from_frame(frame, name), numbers)
+    except DataError as error:  # of what the reader refuses
+        if not any(one.kind in REFUSED for one in findings):
+            where = () if error.trajectory is None else (error.trajectory,)
+            why = str(error).partition(": ")[2]
+            findings.append(Suspicion("refused", None, where, 1, why, "mend the table by hand there"))
     unit_row = next((one for one in dialect if one.startswith("a row of units")), None)
     if unit_row is not None and not UNITS_ROW.get():
         findings.insert(0, Suspicion("units row", None, (), 1, f"row 1 is {unit_row}", "read it with --units-row"))
@@ -102,37 +141,62 @@ def _numbers(
     for required in ("trajectory", "time"):
         if required not in frame.columns:
             raise DataError(f"{name}: column {required}: this column is missing", column=required)
+    if (twice := frame.columns[frame.columns.duplicated()]).size:
+        raise DataError(f"{name}: column {twice[0]}: this column appears twice", column=str(twice[0]))
+    if not len(frame):
+        raise DataError(f"{name}: the table has no rows")
     labels = frame["trajectory"].astype(str).to_numpy()
     starts = np.append(True, labels[1:] != labels[:-1])
     run, findings, values = starts.cumsum() - 1, list[Suspicion](), dict[str, Array]()
-    for column in map(str, frame.columns):
+    for column in frame.columns:
         if column == "trajectory":
             continue
         found, bad = parse_cells(frame[column])
         if column == "time" and bad.any():
             dates = pd.to_datetime(frame[column], errors="coerce", utc=True, format="ISO8601")
             if dates.notna().mean() > 0.9:
-                found, bad = dates.astype("int64").to_numpy() / 1e9, np.zeros_like(bad)
+                found = ((dates - pd.Timestamp(0, tz="UTC")) / pd.Timedelta(seconds=1)).to_numpy(dtype=np.float64)
+                bad = np.zeros_like(bad)
                 why = f"times are dates such as {frame[column].iloc[0]}, expected seconds"
-                mend = 'table["time"] = pd.to_datetime(table["time"], utc=True).astype("int64") / 1e9'
-                findings.append(Suspicion("dates", "time", (), len(frame), why, mend))
+                findings.append(Suspicion("dates", "time", (), len(frame), why, OF_DATES))
         if bad.any():
-            row = int(bad.argmax())
-            cell = shown(str(frame[column].iloc[row]), 40)
-            why = f"{int(bad.sum())} cells are no numbers, the first is {cell!r} in row {row + 1}"
-            mend = f'table["{column}"] = pd.to_numeric(table["{column}"], errors="coerce")'
-            findings.append(Suspicion("text", column, tuple(dict.fromkeys(labels[bad])), int(bad.sum()), why, mend))
-        values[column] = np.where(bad | ~np.isfinite(found), np.nan, found)
+            count, row = int(bad.sum()), int(bad.argmax())
+            said = shown(str(frame[column].iloc[row]), 40)
+            none = "1 cell is no number" if count == 1 else f"{count} cells are no numbers"
+            why = f"{none}, the first is {said!r} in row {row + 1}"
+            mend = f'{cell(column)} = pd.to_numeric({cell(column)}, errors="coerce")'
+            if 2 * count > len(frame) or str(column)[:2] not in ("y.", "x."):
+                mend = "bring it to numbers where the log is made: most cells would be lost, or may not be empty"
+            findings.append(Suspicion("text", str(column), tuple(dict.fromkeys(labels[bad])), count, why, mend))
+        if (endless := np.isinf(found)).any():
+            why = f"{counted(int(endless.sum()), 'cell')} hold no finite number"
+            mend = f"{cell(column)} = {cell(column)}.replace([np.inf, -np.inf], np.nan)"
+            which = tuple(dict.fromkeys(labels[endless]))
+            findings.append(Suspicion("infinite", str(column), which, int(endless.sum()), why, mend))
+        values[str(column)] = np.where(bad | ~np.isfinite(found), np.nan, found)
     time = values.pop("time")
     return Columns(list(labels[starts]), run, time, values, units, step), findings
 
 
-def _frozen(data: Trajectories) -> Iterator[Suspicion]:
-    """Stretches in which a measurement hung, or a gap was interpolated."""
-    stretches = frozen_stretches(data)
-    columns = dict.fromkeys(name for one in stretches for name in one.columns if name.startswith("y."))
-    for column in columns:
-        there = [one for one in stretches if column in one.columns]
+def _frozen(data: Trajectories, table: Columns) -> Iterator[Suspicion]:
+    """Stretches in which a measurement hung, or a gap was interpolated, and the vehicle did not just stand still."""
+    seen = [f"y.{name}" for name in data.measurement_names]
+    stretches, begins = frozen_stretches(data), np.append(0, data.lengths.cumsum(0).numpy())
+
+    def is_hung(name: str, drive: int, first: int, last: int) -> bool:
+        values, rows = table.values[name], slice(begins[drive] + first, begins[drive] + last + 1)
+        here, every = values[rows], values[np.isfinite(values)]
+        if not len(every) or not np.isfinite(here).any() or np.nanmax(here) > np.nanmin(here):
+            return bool(len(every)) and bool(np.isfinite(here).any())
+        is_at_end = here[0] in (every.min(), every.max())
+        others = [table.values[one][rows] for one in seen if one != name]
+        is_still = all(np.isfinite(one).sum() < 2 or np.nanmax(one) == np.nanmin(one) for one in others)
+        return not is_at_end and not is_still and len(np.unique(every)) > FEW_VALUES * len(every)
+
+    for column in dict.fromkeys(name for one in stretches for name in one.columns if name.startswith("y.")):
+        there = [one for one in stretches if column in one.columns and is_hung(column, one.drive, *one.rows)]
+        if not there:
+            continue
         cells = sum(one.rows[1] - one.rows[0] + 1 for one in there)
         begin, end = there[0].seconds
         why = f"{cells} cells lie on straight lines, first from {begin:.2f} to {end:.2f} s"

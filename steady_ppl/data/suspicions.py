@@ -5,11 +5,12 @@ None of it is certain: a vehicle may have stood still, and a log may hold what l
 
 from __future__ import annotations
 
+import json
 import math
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
+from itertools import combinations, pairwise
 
 import numpy as np
 import pandas as pd
@@ -30,19 +31,41 @@ MIN_SHARE_OF_DEGREES = 0.05  # of the cells that are beyond one turn in radians
 EPOCHS = ((1e17, "nanoseconds", 1e9), (1e14, "microseconds", 1e6), (1e11, "milliseconds", 1e3))  # since 1970
 LONG_STEPS = ((1e6, "nanoseconds", 1e9), (1e3, "microseconds", 1e6), (20.0, "milliseconds", 1e3))  # from a step on
 MAX_STEP_RATIO = (300.0, 3000.0)  # of a table's step and a program's, between which times look like milliseconds
-MIN_GAP = 50.0  # median steps
-MIN_SHARED_ROWS = 5  # of two trajectories
+MAX_TIMES_STEP = 20.0  # of a program's step, or one over it, within which a table's step is what the program expects
+MIN_GAP, MAX_GAPS = 50.0, 0.02  # median steps, and share of the steps that may be so long
+MAX_REPEATED_TIMES = 0.05  # share of the rows, beyond which stamps are too coarse
+MIN_SHARED_ROWS = 5  # that follow one another, of two trajectories
+MIN_STAND = 10  # rows of a vehicle that stands still
+MAX_OUTLIERS = 0.02  # share of a column's cells; more are no outliers
+MAX_PAIRS = 2000  # of columns that are compared
 SAME_LINE = 1e-10  # share of its variance by which a column may be beside a line through another
 SPANS = (4, 8, 16)  # rows, over which a vehicle's way is compared with its heading
 MIN_SPANS = 3  # of a log
 MIN_CONCENTRATION, MIN_CONTRAST = 0.5, 0.35  # of headings about the way, and by which another sense must be worse
 MIN_RAYLEIGH = 2.2  # of these, in spans: chance gives so much in one of a hundred
 MAX_BESIDE_QUARTER = 0.4  # rad, of a heading's offset beside whole quarters of a turn
+NEW_LABELS = (
+    'table["trajectory"] = table["trajectory"].astype(str) + "-" + (table["time"].diff() < 0).cumsum().astype(str)'
+)
 SAMPLE = 20_000  # rows by which columns are compared
-ANGLE = re.compile(r"(heading|bearing|compass|azimuth|course|theta|psi|angle|steer|yaw|roll|pitch)(?!.*rate)", re.I)
-HEADING = re.compile(r"(heading|compass|azimuth|course|theta|psi|yaw)(?!.*rate)", re.I)
+ANGLE = re.compile(
+    r"(heading|bearing|compass|azimuth|course|theta|yaw|(?<![a-z])(angle|roll|pitch|steer|steering|psi))"
+    r"(?![a-z]|[ _]?(rate|speed|vel|torque|moment|force|dot|acc))",
+    re.I,
+)
+HEADING = re.compile(r"(heading|compass|azimuth|course|theta|psi|yaw)(?!.*(rate|vel|acc|torque|moment))", re.I)
 EAST = re.compile(r"^(?P<start>.*?)(?P<axis>x|east|easting)$", re.I)
 NORTHS = {"x": "y", "east": "north", "easting": "northing"}
+
+
+def cell(name: str) -> str:
+    """A column of the table in a line for pandas."""
+    return f"table[{json.dumps(name, ensure_ascii=False)}]"
+
+
+def counted(count: int, noun: str) -> str:
+    """How many there are."""
+    return f"{count} {noun}{'' if count == 1 else 's'}"
 
 
 @dataclass(frozen=True)
@@ -91,6 +114,12 @@ class Columns:
         """The labels of trajectories in which some rows `(N,)` bool are."""
         return tuple(dict.fromkeys(self.labels[i] for i in np.unique(self.run[rows])))
 
+    def dropping(self, name: str) -> str:
+        """The line that leaves a column out; advice where a program reads it."""
+        if name in self.units:
+            return "the program reads it: look whether the log has it under another name, or take it out of both"
+        return f"table = table.drop(columns={json.dumps(name, ensure_ascii=False)})"
+
     def is_angle(self, name: str) -> bool:
         unit = self.units.get(name)
         return bool(ANGLE.search(name)) if unit is None else unit == "rad"
@@ -124,31 +153,47 @@ def _runs(table: Columns) -> Iterator[Suspicion]:
         yield Suspicion("one row", None, single, len(single), why, mend)
     if again := tuple(places.index[places > 1]):
         why = "its rows are in several places, between those of others"
-        mend = 'table = table.sort_values(["trajectory", "time"])'
+        mend = 'table = table.sort_values(["trajectory", "time"], kind="stable")'
+        if _restarts(table, again):
+            why = "its rows are in several places, and its time begins again there: one label for several drives"
+            mend = NEW_LABELS
         yield Suspicion("apart", None, again, int(rows[list(again)].sum()), why, mend)
     yield from _shared(table)
+
+
+def _restarts(table: Columns, labels: Sequence[str]) -> bool:
+    """Whether the rows of a label in a later place begin before the end of those in the place before."""
+    begins = table.begins
+    ends = np.append(begins[1:], len(table.run)) - 1
+    for label in labels:
+        places = [i for i, one in enumerate(table.labels) if one == label]
+        back = [table.time[begins[j]] <= table.time[ends[i]] for i, j in pairwise(places)]
+        if any(back):
+            return True
+    return False
 
 
 def _shared(table: Columns) -> Iterator[Suspicion]:
     """Rows of two trajectories that say the same: these overlap, or one is a copy of the other."""
     seen = table.of("y.")
-    if not seen:
+    if not seen or len(set(table.labels)) < 2:
         return
     cells = pd.DataFrame({name: table.values[name] for name in [*table.of("u."), *seen]})
-    moving = (
-        cells[seen].notna().any(axis=1).to_numpy() & (cells[seen].diff().abs().max(axis=1).fillna(1) > 0).to_numpy()
-    )
-    keys = pd.util.hash_pandas_object(cells, index=False)[moving]
-    owner = pd.Series(np.array(table.labels, dtype=object)[table.run])[moving]
-    if len(set(table.labels)) < 2 or not keys.duplicated().any():
+    moves = (cells[seen].diff().abs().max(axis=1) > 0).to_numpy()
+    own = pd.util.hash_pandas_object(cells, index=False).to_numpy()
+    keys, inside = own.copy(), moves.copy()
+    for back in range(1, MIN_SHARED_ROWS):  # rows that follow one another
+        keys[back:] = keys[back:] * np.uint64(1_000_003) + own[:-back]
+        inside[back:] &= moves[:-back] & (table.run[back:] == table.run[:-back])
+        inside[:back] = False
+    if not pd.Series(keys[inside]).duplicated().any():
         return
-    twice = keys.duplicated(keep=False)
-    several = owner[twice].groupby(keys[twice]).nunique()
-    rows = keys.isin(several.index[several > 1])
-    counts = owner[rows].value_counts()
-    shared = tuple(label for label in dict.fromkeys(owner[rows]) if counts[label] >= MIN_SHARED_ROWS)
-    if len(shared) > 1:
-        count = int(rows.sum())
+    rows = np.flatnonzero(inside)
+    owner = pd.Series(np.array(table.labels, dtype=object)[table.run[rows]])
+    several = owner.groupby(keys[rows]).transform("nunique").to_numpy() > 1
+    if several.any():
+        shared = tuple(dict.fromkeys(owner[several]))
+        count = int(several.sum()) + len(shared) * (MIN_SHARED_ROWS - 1)
         why = f"{count} rows say exactly what rows of another trajectory say: they overlap, or one is a copy"
         mend = "keep each row in one trajectory: overlapping drives count twice, and a test on a copy tests nothing"
         yield Suspicion("overlap", None, shared, count, why, mend)
@@ -156,32 +201,43 @@ def _shared(table: Columns) -> Iterator[Suspicion]:
 
 def _times(table: Columns) -> Iterator[Suspicion]:
     """Times that go back, are no seconds, or have gaps."""
-    inner = table.run[1:] == table.run[:-1]
-    steps = np.diff(table.time)[inner]
+    all_steps = np.diff(table.time)
+    inner = (table.run[1:] == table.run[:-1]) & np.isfinite(all_steps)
+    steps = all_steps[inner]
     if not len(steps):
         return
-    rows = np.append(False, inner & ~(np.diff(table.time) > 0))
-    if rows.any():
-        kind = "repeat" if (np.diff(table.time)[rows[1:]] == 0).all() else "go back"
-        why = f"times {kind} in {int(rows.sum())} rows, and have to rise from row to row"
+    rows = np.append(False, inner & ~(all_steps > 0))
+    count = int(rows.sum())
+    if count:
+        repeats = bool((all_steps[rows[1:]] == 0).all())
+        why = f"times {'repeat' if repeats else 'go back'} in {counted(count, 'row')}, and have to rise from row to row"
         mend = 'table = table.sort_values(["trajectory", "time"]).drop_duplicates(["trajectory", "time"])'
-        yield Suspicion("time", "time", table.within(rows), int(rows.sum()), why, mend)
+        starts = table.time[table.begins][table.run[rows]]
+        lengths = table.time[rows] - starts
+        if repeats and count > MAX_REPEATED_TIMES * len(table.time):
+            mend = "the stamps are coarser than the rows: take finer ones, or spread those that are equal evenly"
+        elif not repeats and bool((np.abs(lengths) <= np.abs(table.time[rows.nonzero()[0] - 1] - starts) / 2).all()):
+            why += ": the time begins again, one label for several drives"
+            mend = NEW_LABELS
+        yield Suspicion("time", "time", table.within(rows), count, why, mend)
     step, first = float(np.median(steps[steps > 0])) if (steps > 0).any() else 0.0, float(np.nanmin(table.time))
     unit = next(((name, by) for least, name, by in EPOCHS if first > least), None)
     told = f"they begin at {first:.6g}"
-    if unit is None:
+    ratio = step / table.step if table.step else math.nan
+    if unit is None and not 1 / MAX_TIMES_STEP < ratio < MAX_TIMES_STEP:
         unit = next(((name, by) for least, name, by in LONG_STEPS if step >= least), None)
         told = f"rows are {step:.3g} apart"
-    if unit is None and table.step and MAX_STEP_RATIO[0] < step / table.step < MAX_STEP_RATIO[1]:
-        unit, told = ("milliseconds", 1e3), f"rows are {step:.3g} apart, steps of the program {table.step:g} s"
+        if unit is None and MAX_STEP_RATIO[0] < ratio < MAX_STEP_RATIO[1]:
+            unit, told = ("milliseconds", 1e3), f"rows are {step:.3g} apart, steps of the program {table.step:g} s"
     if unit is not None:
         name, by = unit
         why = f"{told}: are these {name}? The table's times are seconds"
-        yield Suspicion("time unit", "time", (), len(table.time), why, f'table["time"] /= {by:g}')
-    gaps = np.append(False, inner & (np.diff(table.time) > MIN_GAP * step)) if step > 0 else rows
-    if gaps.any():
-        longest = float(np.diff(table.time)[gaps[1:]].max())
-        why = f"{int(gaps.sum())} steps are longer than {MIN_GAP:g} others, the longest {longest:.4g}"
+        yield Suspicion("time unit", "time", (), len(table.time), why, f"{cell('time')} /= 1e{round(math.log10(by))}")
+    gaps = np.append(False, inner & (all_steps > MIN_GAP * step)) if step > 0 else np.zeros_like(rows)
+    if 0 < gaps.sum() <= MAX_GAPS * len(steps):
+        longest = float(all_steps[gaps[1:]].max())
+        longer = counted(int(gaps.sum()), "step") + (" is" if gaps.sum() == 1 else " are")
+        why = f"{longer} longer than {MIN_GAP:g} usual steps, the longest {longest:.4g}"
         mend = "let a trajectory end before a gap, and another one begin behind it"
         yield Suspicion("gap", "time", table.within(gaps), int(gaps.sum()), why, mend)
 
@@ -196,7 +252,7 @@ def _constants(table: Columns) -> Iterator[Suspicion]:
             why = f"this {what} is {seen[0]:.6g} in every row: it tells nothing of what it does"
             yield Suspicion("constant", name, (), len(seen), why, "look whether the log has it under another name")
         elif not len(seen):
-            yield Suspicion("empty", name, (), 0, "every cell is empty", f'table = table.drop(columns="{name}")')
+            yield Suspicion("empty", name, (), 0, "every cell is empty", table.dropping(name))
 
 
 def _codes(table: Columns) -> Iterator[Suspicion]:
@@ -210,9 +266,13 @@ def _codes(table: Columns) -> Iterator[Suspicion]:
             rows = values == code
             rest = seen[seen != code]
             cells = "1 cell is" if rows.sum() == 1 else f"{int(rows.sum())} cells are"
-            why = f"{cells} {code:g}, all others between {rest.min():.4g} and {rest.max():.4g}"
+            told = f"{code:g}" if float(f"{code:g}") == code else repr(code)
+            why = f"{cells} {told}, all others between {rest.min():.4g} and {rest.max():.4g}"
             why += ": is it what the log writes where nothing was measured?"
-            mend = f'table.loc[table["{name}"] == {code:g}, "{name}"] = float("nan")'
+            is_code = f"{cell(name)} == {told}"
+            mend = f'table.loc[{is_code}, {json.dumps(name, ensure_ascii=False)}] = float("nan")'
+            if name.startswith("u."):  # a command may not be empty
+                mend = f'{cell(name)} = {cell(name)}.mask({is_code}).groupby(table["trajectory"]).ffill()'
             yield Suspicion("code", name, table.within(rows), int(rows.sum()), why, mend)
             table.values[name] = np.where(rows, np.nan, values)
 
@@ -220,17 +280,33 @@ def _codes(table: Columns) -> Iterator[Suspicion]:
 def _code(table: Columns, name: str, seen: Array) -> float | None:
     for code in dict.fromkeys((float(seen.min()), float(seen.max()), 0.0)):
         cells = seen == code
-        count = int(cells.sum())
-        if not 0 < count < 0.95 * len(seen) or (count < MIN_REPEATS and code not in CODES):
+        count, is_known = int(cells.sum()), code in CODES
+        if not 0 < count < len(seen) or (count < MIN_REPEATS and not is_known):
             continue
         rest = seen[~cells]
         low, high = float(rest.min()), float(rest.max())
-        away = max(low - code, code - high)
-        if away > FAR * (high - low) and (high > low or code in CODES):
+        is_far = max(low - code, code - high) > FAR * (high - low) and (high > low or is_known)
+        if is_known and is_far:
             return code
-        if count >= MIN_REPEATS and name[:2] == "y." and _is_apart(table, name, code):
+        if name.startswith("u.") or count > 0.95 * len(seen) or _stands(table, name, code):
+            continue
+        if is_far or (name.startswith("y.") and _is_apart(table, name, code)):
             return code
     return None
+
+
+def _stands(table: Columns, name: str, value: float) -> bool:
+    """Whether a column keeps a value for long, or only where trajectories begin and end: the vehicle stood still."""
+    values = table.values[name]
+    rows = np.flatnonzero(np.isfinite(values))
+    same = values[rows] == value
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], same.astype(int), [0]])))
+    begins, ends = edges[::2], edges[1::2]
+    lengths = ends - begins
+    first = (begins == 0) | (table.run[rows[begins]] != table.run[rows[np.maximum(begins - 1, 0)]])
+    after = np.minimum(ends, len(rows) - 1)
+    last = (ends == len(rows)) | (table.run[rows[after]] != table.run[rows[ends - 1]])
+    return bool(np.median(lengths) >= MIN_STAND or (first | last).all())
 
 
 def _is_apart(table: Columns, name: str, code: float) -> bool:
@@ -262,19 +338,16 @@ def _outliers(table: Columns) -> Iterator[Suspicion]:
             first, last = later[one], later[other]
             near = sizes[max(0, one - 2) : one].tolist() + sizes[other + 1 : other + 3].tolist()
             is_alone = not near or max(near) < 0.2 * sizes[one]
-            if (
-                0.5 < back < 2
-                and last - first <= MAX_JUMP_ROWS
-                and is_alone
-                and table.run[rows[first]] == table.run[rows[last]]
-            ):
+            is_short = last - first <= MAX_JUMP_ROWS and table.run[rows[first]] == table.run[rows[last]]
+            if 0.5 < back < 2 and is_short and is_alone:
                 wrong[first:last] = True
-        if wrong.any():
+        if 0 < wrong.sum() <= max(1.0, MAX_OUTLIERS * len(rows)):
             at = np.zeros(len(table.run), dtype=bool)
             at[rows[wrong]] = True
             when = float(table.time[rows[wrong][0]])
-            told = "1 reading jumps" if wrong.sum() == 1 else f"{int(wrong.sum())} readings jump"
-            why = f"{told} away and back, the first at {when:.6g} s: is it wrong?"
+            one = wrong.sum() == 1
+            told = "1 reading jumps" if one else f"{int(wrong.sum())} readings jump"
+            why = f"{told} away and back, the first at {when:.6g} s: {'is it' if one else 'are they'} wrong?"
             mend = "steady check RUN TABLE --mask CLEAN.csv leaves out what a fitted model finds impossible"
             yield Suspicion("outlier", name, table.within(at), int(wrong.sum()), why, mend)
 
@@ -282,31 +355,26 @@ def _outliers(table: Columns) -> Iterator[Suspicion]:
 def _copies(table: Columns) -> Iterator[Suspicion]:
     """Columns that are other columns again, perhaps in another unit."""
     stride = max(1, len(table.run) // SAMPLE)
-    taken = set[str]()
+    taken, left = set[str](), MAX_PAIRS
     for kind in ("u.", "y."):
         names = [name for name in table.of(kind) if np.isfinite(table.values[name]).sum() >= MIN_CELLS]
-        for index, one in enumerate(names):
-            for other in names[index + 1 :]:
-                if other in taken:
-                    continue
-                a, b = table.values[one][::stride], table.values[other][::stride]
-                both = np.isfinite(a) & np.isfinite(b)
-                if both.sum() < 20 or len(np.unique(a[both][:1000])) < 5:
-                    continue
-                slope, offset = _line(a[both], b[both])
-                beside = float(np.var(b[both] - slope * a[both] - offset))
-                if beside > SAME_LINE * float(np.var(b[both])) or float(np.var(b[both])) == 0:
-                    continue
-                taken.add(other)
-                is_same = abs(slope - 1) < 1e-6 and abs(offset) < 1e-6 * float(np.std(b[both]))
-                how = (
-                    "the same as"
-                    if is_same
-                    else f"{slope:.5g} times"
-                    + (f" (and {offset:+.4g})" if abs(offset) > 1e-6 * float(np.std(b[both])) else "")
-                )
-                why = f"it is {how} {one}: it tells nothing new" + (", and counts twice" if kind == "y." else "")
-                yield Suspicion("copy", other, (), int(both.sum()), why, f'table = table.drop(columns="{other}")')
+        for one, other in combinations(names, 2):
+            if other in taken or left == 0:
+                continue
+            left -= 1
+            a, b = table.values[one][::stride], table.values[other][::stride]
+            both = np.isfinite(a) & np.isfinite(b)
+            a, b = a[both], b[both]
+            if len(a) < 2 * MIN_CELLS or len(np.unique(a[:1000])) < 5 or not (spread := float(np.std(b))) > 0:
+                continue
+            slope, offset = _line(a, b)
+            if float(np.var(b - slope * a - offset)) > SAME_LINE * spread**2:
+                continue
+            taken.add(other)
+            shift = f" (and {offset:+.4g})" if abs(offset) > 1e-6 * spread else ""
+            how = "the same as" if abs(slope - 1) < 1e-6 and not shift else f"{slope:.5g} times"
+            why = f"it is {how} {one}{shift}: it tells nothing new" + (", and counts twice" if kind == "y." else "")
+            yield Suspicion("copy", other, (), len(a), why, table.dropping(other))
 
 
 def _line(a: Array, b: Array) -> tuple[float, float]:
@@ -326,7 +394,7 @@ def _degrees(table: Columns) -> Iterator[Suspicion]:
             continue
         if float((sizes > 2 * math.pi).mean()) > MIN_SHARE_OF_DEGREES:
             why = f"it is between {seen.min():.4g} and {seen.max():.4g}, and angles are radians: are these degrees?"
-            yield Suspicion("degrees", name, (), len(seen), why, f'table["{name}"] *= np.pi / 180')
+            yield Suspicion("degrees", name, (), len(seen), why, f"{cell(name)} *= np.pi / 180")
             table.values[name] = np.deg2rad(values)
 
 
@@ -398,15 +466,15 @@ def _against_course(table: Columns, east: str, north: str, heading: str) -> Iter
         return
     turn = f"{quarters * math.pi / 2:.6g}"
     clockwise = sign == -1 and quarters == 1
-    counts = "clockwise" if sign == -1 and quarters == 0 else f"{turn} beside it"
-    counts = "from north, clockwise" if clockwise else counts
-    why = f"along the way of {east} and {north} it counts {counts}; expected is from {east} towards {north}"
+    counts = "from north, clockwise" if clockwise else "clockwise" if quarters == 0 else f"{turn} rad too much"
+    if sign == -1 and quarters and not clockwise:
+        counts = f"clockwise, {turn} rad beside it"
+    why = f"along the way of {east} and {north} it counts {counts}; expected is 0 along {east}, pi/2 along {north}"
     why += f"; or {east} and {north} are swapped" if clockwise else ""
-    if sign == -1:
-        mended = f'{turn} - table["{heading}"]' if quarters else f'-table["{heading}"]'
-    else:
-        mended = f'table["{heading}"] - {turn}'
-    yield Suspicion("heading", heading, (), len(rows), why, f'table["{heading}"] = {mended}')
+    why += "; or the vehicle drives backwards" if sign == 1 and abs(quarters) == 2 else ""
+    mended = f"{turn} - {cell(heading)}" if quarters else f"-{cell(heading)}"
+    mended = mended if sign == -1 else f"{cell(heading)} - {turn}"
+    yield Suspicion("heading", heading, (), len(rows), why, f"{cell(heading)} = {mended}")
 
 
 LOOKS: Sequence[Callable[[Columns], Iterator[Suspicion]]] = (

@@ -34,7 +34,7 @@ class Correction:
     """A factor on declared standard deviations, or heavy tails, in all fits that follow."""
 
     variant: Variant
-    gain: float  # nats of held-out log p(y) that it brought
+    gain: float  # nats of held-out log p(y) that it brought, at the time step at which it was found
 
 
 class Suited(NamedTuple):
@@ -139,10 +139,15 @@ def with_suitable_noise(own: Refit, wanted: Callable[[Variant], bool], tails: Va
 
 
 def with_same_noise(own: Refit, suited: Refit, corrections: list[Correction]) -> Suited | None:
-    """A fitted program with the corrections that it has at another time step, fitted from there; None: it fails."""
-    near = fit_near(own, suited, [one.variant for one in corrections])
+    """A fitted program with the corrections that it has at another time step, fitted from there.
+
+    None where that fails, has not converged, or brings too little here: they may have stood for the other step.
+    """
+    near = fit_near(own, suited, [one.variant for one in corrections]) if own.fitting == suited.fitting else ""
     refit = near if isinstance(near, str) else judged_fits(near)
-    return None if isinstance(refit, str) else Suited(replace(refit, unwidened=suited.unwidened), corrections)
+    if isinstance(refit, str) or not refit.converged or float((refit.held_out - own.held_out).sum()) <= CLEAR_GAIN:
+        return None
+    return Suited(replace(refit, unwidened=own.unwidened), corrections)
 
 
 def _held_out(refit: Refit) -> float:

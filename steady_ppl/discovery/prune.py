@@ -9,13 +9,13 @@ from steady_ppl.discovery.candidates import (
     TIE_NATS,
     Candidate,
     at_its_best_place,
-    bar_of,
     judged,
     moved_to_likelier_place,
 )
 from steady_ppl.discovery.judges import ParticleJudge, first_enough
 from steady_ppl.discovery.refits import Fits, Refit, fit_near, judged_fits, refit_with, refit_with_all
 from steady_ppl.discovery.search_state import Found, Search, with_places_of
+from steady_ppl.effects import attached
 
 SAME_MAXIMUM = 0.2  # nats within which fits from two starts have ended at the same place
 MIN_NATS_OF_DIVERGENCE = 25.0  # nats above every fit that it is a part of, from which a fit is not to be believed
@@ -28,8 +28,9 @@ def prune(search: Search) -> None:
         without = _without(search, found)
         if isinstance(without, str) or without is found.without:  # beside which it was chosen among the same rivals
             continue
-        there, as_it_stands = set(without.effects), judged(without, found.candidate.tested, search.final)
-        rivals = [one for one in found.contenders[1:] if one.variant.label not in there]
+        there = {variant.name for variant in attached(without.program)}
+        as_it_stands = judged(without, found.candidate.tested, search.final)
+        rivals = [one for one in found.contenders[1:] if one.variant.name not in there]
         again = [as_it_stands, *(_in_its_place(search, found, without, rival, as_it_stands) for rival in rivals)]
         needed = partial(first_enough, lambda c: c.total > TIE_NATS)
         best, again = ParticleJudge(without).chosen(again, needed)
@@ -42,16 +43,15 @@ def prune(search: Search) -> None:
 
 
 def _in_its_place(search: Search, found: Found, without: Refit, rival: Candidate, stands: Candidate) -> Candidate:
-    """A rival beside the other effects; given up where it stays far behind what `stands` in the place."""
+    """A rival beside the other effects, at its best place where it is near what `stands` there."""
     assert isinstance(rival.refit, Refit)
-    known, bar = search.final.maxima[0], bar_of([search.final])
     begin = rival.refit.coefficient(rival.variant)
-    one = judged(without, rival.tested, refit_with(without, rival.variant, begin, information=known, threshold=bar))
+    one = judged(without, rival.tested, refit_with(without, rival.variant, begin))
     if one.total <= stands.total - MAX_NATS_OF_RIVAL:  # no knee or place brings it near
         return one
     one = at_its_best_place(without, one)
     for other in (other for other in search.found if other is not found):
-        if isinstance(one.refit, Refit) and one.is_judged:
+        if isinstance(one.refit, Refit):
             moved = moved_to_likelier_place(search.base, one.refit, other.candidate.variant)
             one = one if moved is one.refit else judged(without, one.tested, moved)
     return one

@@ -45,6 +45,7 @@ from steady_ppl.effects import Effect, Variant, attached
 from steady_ppl.model.problem import Problem
 from steady_ppl.model.program import Program
 from steady_ppl.model.substeps import with_substeps
+from steady_ppl.utils.journal import close_journal
 from steady_ppl.utils.progress import stages
 from steady_ppl.utils.text import reason_of
 
@@ -53,6 +54,7 @@ MAX_SUBSTEPS_OF_FIT = 128  # of a fitted program, at most: what a coarser step l
 MAX_CURVES = 3  # adding curves that are fitted
 MAX_ROUNDS = MAX_EFFECTS + 3  # with factors on noise, which take no place, and a last test
 NOT_FINER = "what was found was not looked at in finer time steps: {}"
+COARSE = "what was found asks for {} substeps a row: all sizes are those of a step that is too coarse"
 NOTHING_TESTED = "the program as it stands was fitted, and no effect has been tested yet"
 
 
@@ -116,14 +118,17 @@ def search(problem: Problem, valid: Trajectories, settings: Settings) -> Search:
             there = replace(settings, declared=with_substeps(settings.declared, finer))
             fresh = Search(own, base, base, step, gained, outliers, corrections, found.asks)
             again = _rounds(fresh, there, carried=found.found, looks_at_step=False)
-            if not again.interrupted:
+            if again.interrupted != LOOKING:
                 return again
             found.interrupt(FINER)
         except KeyboardInterrupt:
             found.interrupt(FINER)
         except Exception as error:  # also of the program's own code, in steps that nobody tried before
             found.notes.append(NOT_FINER.format(reason_of(error)))
+            close_journal()
             _end(found, settings)
+            return found
+    found.notes.append(COARSE.format(finer))
     return found
 
 
@@ -151,9 +156,9 @@ def _rounds(found: Search, settings: Settings, carried: Sequence[Found] = (), *,
     What was found at a coarser step and is `carried` is added after the first round, as far as it is needed. Where it
     `looks_at_step`, it ends before curves if what was found `asks` for a finer one.
     """
-    with stages(("", 6), ("looking again", 1), ("", 1)) as begin:
-        doing = LOOKING
-        try:
+    doing = LOOKING
+    try:
+        with stages(("", 6), ("looking again", 1)) as begin:
             begin()
             _add_all(found, settings, carried)
             doing = "looking again at what was found"
@@ -163,27 +168,28 @@ def _rounds(found: Search, settings: Settings, carried: Sequence[Found] = (), *,
             doing = FINER
             if looks_at_step:
                 _look_at_step(found)
-        except KeyboardInterrupt as stop:
-            if not found.rounds:
-                raise KeyboardInterrupt(NOTHING_TESTED) from stop
-            found.interrupt(doing)
-        begin()
-        if found.asks is None and not found.interrupted:
-            _end(found, settings)
+    except KeyboardInterrupt as stop:
+        if not found.rounds:
+            raise KeyboardInterrupt(NOTHING_TESTED) from stop
+        found.interrupt(doing)
+    if found.asks is None and not found.interrupted:
+        _end(found, settings)
     return found
 
 
 def _end(found: Search, settings: Settings) -> None:
     """Fit curves beside what was found, and take corrections back that it makes needless, until an interrupt."""
-    with stages(("fitting curves", 1)) as begin:
-        try:
-            begin()
-            if found.found and not found.curves and (len(found.found) > 1 or not found.rounds[1].nothing_found):
+    try:
+        if found.found and not found.curves and (len(found.found) > 1 or not found.rounds[1].nothing_found):
+            with stages(("fitting curves", 1)) as begin:
+                begin()
                 found.curves = _curves(found)
-            if found.found:
-                _drop_corrections(found, settings)
-        except KeyboardInterrupt:
-            found.interrupt("fitting curves")
+        if found.found:
+            _drop_corrections(found, settings)
+    except KeyboardInterrupt:
+        found.interrupt("fitting curves")
+    except Exception as error:  # also of the program's own code
+        found.notes.append(f"no curve was fitted beside what was found: {reason_of(error)}")
 
 
 def _drop_corrections(found: Search, settings: Settings) -> None:
@@ -347,7 +353,7 @@ def _chosen(
     a filter may have denied the one beside which they stayed behind."""
     while True:
         best, ranked = judge.chosen(candidates, choose)
-        most = max((c.total for c in ranked if c.is_judged), default=math.inf)
+        most = max((c.total for c in ranked if c.is_judged), default=-math.inf)
         candidates = [c if c.is_judged or c.total <= most else _fitted_again(judge.now, c) for c in ranked]
         if all(one is other for one, other in zip(candidates, ranked, strict=True)):
             return best, ranked

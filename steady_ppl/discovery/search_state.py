@@ -56,7 +56,8 @@ class Found:
     def contenders(self) -> list[Candidate]:
         """The best and those that were nearly as good in its place."""
         best = self.candidate
-        near = [c for c in self.rivals if c is not best and c.total > best.total - MAX_NATS_OF_RIVAL]
+        others = (c for c in self.rivals if c.variant.name != best.variant.name)
+        near = [c for c in others if c.total > best.total - MAX_NATS_OF_RIVAL]
         return [c for c in (best, *near) if isinstance(c.refit, Refit)]
 
 
@@ -71,8 +72,8 @@ class Search:
     gained: float  # nats that fitting the program as it stands gained on the training drives
     outliers: list[Outliers] = field(default_factory=list)  # of the training and of the validation drives
     corrections: list[Correction] = field(default_factory=list)  # of the noise that it declares
-    with_found: StepCheck | None = None  # the same with what was found at a coarser step, which asked for this one
-    asks: StepCheck | None = None  # the same with what was found here, where that asks for a finer step
+    with_found: StepCheck | None = None  # the final program of the coarser search that asked for this step
+    asks: StepCheck | None = None  # the final program, where it asks for a finer step
     rounds: list[Round] = field(default_factory=list)  # the last tests the final program unless the search ended early
     found: list[Found] = field(default_factory=list)  # the effects that were added
     curves: list[Candidate] = field(default_factory=list)  # fitted in place of the first effect, best first
@@ -101,7 +102,7 @@ class Search:
     @property
     def departed(self) -> list[Tested]:
         """What says, in the last tests, that the fitted noise is not the declared; a missing effect may say so too."""
-        if self.interrupted in (LOOKING, FINER):
+        if self.interrupted == LOOKING:
             return []
         tests = self.rounds[-1].screening.tests
         return [tested for tested in tests.tested if tested.departure and tested.p_value <= tests.critical]

@@ -102,9 +102,94 @@ def test_its_line_mends_the_table(clean, tmp_path, kind):
     (one,) = st.doctor(file).findings
     room = {"table": pd.read_csv(file, dtype={"trajectory": str}), "pd": pd, "np": np}
     exec(one.mend, room)
-    mended = st.doctor(written(tmp_path, room["table"]))
-    assert mended.findings == []
-    assert len(st.read_table(file)) == 5 if kind != "one row" else True
+    mended = written(tmp_path, room["table"])
+    assert st.doctor(mended).findings == []
+    data = st.read_table(mended)
+    assert len(data) == 5 and float(data.steps[data.transitions].mean()) == pytest.approx(0.1, rel=1e-3)
+
+
+def test_the_line_that_reads_it_takes_every_dialect(clean, tmp_path):
+    """Labels such as 007 stay as they are."""
+    file = tmp_path / "drives.csv"
+    header, _, rest = (
+        clean.assign(trajectory="00" + clean["trajectory"].astype(str)).to_csv(index=False).partition("\n")
+    )
+    rest = rest.replace(",", ";").replace(".", ",")
+    text = f"# from a boat\n{header.replace(',', ' ; ')}\n-;s;N;N;m;m;rad\n{rest}"
+    file.write_bytes(text.encode("utf-16"))
+    room = {}
+    exec(st.doctor(file).reading.replace(repr(file.name), repr(str(file))), room)
+    table = room["table"]
+    assert list(table.columns) == list(clean.columns) and set(table["trajectory"]) == {f"00{k}" for k in range(1, 6)}
+    assert np.allclose(table.drop(columns="trajectory").astype(float), clean.drop(columns="trajectory"), equal_nan=True)
+
+
+def still(frame):
+    """A vehicle that stands for two seconds at the beginning of each drive."""
+    since = frame["time"] - frame.groupby("trajectory")["time"].transform("first")
+    return frame.assign(**{"y.speed": np.where(since < 2, 0.0, 3 + 0.1 * np.sin(since) + 0.01 * frame["y.gps_x"])})
+
+
+def resting(frame):
+    return frame.assign(**{"u.left": np.where(frame.index % 100 < 80, 0.0, 1 + frame.index % 7)})
+
+
+def oddly_named(frame):
+    return frame.assign(**{"u.controller": 20 + frame["u.left"] ** 2, "y.roller_torque": frame["y.gps_x"] ** 2 + 60})
+
+
+HARMLESS = {
+    "a vehicle that stands still": still,
+    "a joystick that is mostly at rest": resting,
+    "an encoder's whole numbers": lambda f: f.assign(**{"y.ticks": np.floor(f.index % 201 / 15)}),
+    "a range that is clipped": lambda f: f.assign(**{"y.range": (f["y.gps_x"].abs() + 1).clip(upper=8.0)}),
+    "names that hold parts of angles": oddly_named,
+    "rows of 30 s": lambda f: f.assign(time=300 * f["time"]),
+}
+
+
+@pytest.mark.parametrize("what", HARMLESS)
+def test_what_logs_ordinarily_hold_is_not_suspicious(clean, tmp_path, what):
+    program = example("gps_boat")
+    if what == "rows of 30 s":
+        program.step = 30.0
+    assert st.doctor(written(tmp_path, HARMLESS[what](clean)), program).findings == []
+
+
+def test_a_label_for_several_drives_gets_new_labels(clean, tmp_path):
+    file = written(tmp_path, clean.assign(trajectory="all"))
+    (one,) = st.doctor(file).findings
+    assert one.kind == "time" and "one label for several drives" in one.why
+    room = {"table": pd.read_csv(file, dtype={"trajectory": str})}
+    exec(one.mend, room)
+    assert len(st.read_table(written(tmp_path, room["table"]))) == 5
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("trajectory,time,y.range\n", "the table has no rows"),
+        ("trajectory,time,y.range,y.range\na,0,1,1\na,1,2,2\n", "column y.range: this column appears twice"),
+    ],
+)
+def test_a_table_that_holds_nothing_or_a_column_twice_is_refused(tmp_path, text, says):
+    (tmp_path / "drives.csv").write_text(text)
+    with pytest.raises(DataError, match=says):
+        st.doctor(tmp_path / "drives.csv")
+
+
+def test_what_the_reader_refuses_is_a_finding_beside_the_others(clean, tmp_path):
+    """An empty command within a drive, and a code in another column."""
+    frame = clean.assign(**{"u.left": clean["u.left"].where(clean.index != 50)})
+    found = st.doctor(written(tmp_path, SPOILED["code"][0](frame)))
+    assert [one.kind for one in found.findings] == ["code", "refused"] and "u.left" in found.findings[1].why
+
+
+def test_a_command_that_cannot_read_a_table_names_the_doctor(clean, tmp_path, capsys):
+    file = written(tmp_path, SPOILED["dates"][0](clean))
+    assert steady("fit", "models/gps_boat.py", file, "--recipe", "hand", "--out", tmp_path / "run") == 2
+    first, *_ = capsys.readouterr().err.splitlines()
+    assert "suspicious are dates" in first and f"`steady doctor {file}`" in first
 
 
 def test_axes_that_are_swapped_are_told_by_the_known_states(tmp_path):

@@ -41,23 +41,22 @@ def pruned(monkeypatch):
             asked.append((without.name, tested, fitted if isinstance(fitted, str) else fitted.name))
             return Rival(tested, {"drag": drag, "lag": rival, "bias": 9.0}[tested], fitted)
 
-        def refit_with(without, variant, value, *, information, threshold):
-            assert threshold == "bar" and information == "known"
+        def refit_with(without, variant, value):
             return refit(variant.name, *without.programs[0])
 
         monkeypatch.setattr(Refit, "effects", property(lambda self: self.programs[0]))
         monkeypatch.setattr(Refit, "coefficient", lambda self, variant: torch.tensor([0.5]))
-        for name, stub in (
+        for replaced, stub in (
             ("judged", judged),
             ("refit_with", refit_with),
             ("refit_with_all", lambda start, later, near: refit(*start.programs[0], *(v.name for v, _ in later))),
             ("fit_near", lambda *_: "paths of other states are no start"),
             ("at_its_best_place", lambda without, one: one),
             ("moved_to_likelier_place", lambda base, fitted, variant: fitted),
-            ("bar_of", lambda fits: "bar"),
+            ("attached", lambda names: [SimpleNamespace(name=name) for name in names]),
             ("with_places_of", lambda final, found: found),
         ):
-            monkeypatch.setattr(pruning, name, stub)
+            monkeypatch.setattr(pruning, replaced, stub)
         first_found = Found(one := Rival("drag", 30.0, first), [one, *others], base)
         found = [first_found, Found(two := Rival("bias", 9.0, both), [two], first)]
         search = Search(base, base, both, None, 0.0, found=found)

@@ -294,7 +294,62 @@ def test_an_interrupt_at_a_finer_time_step_leaves_the_coarser_search(asking):
     again.interrupt(search.LOOKING)
     for outcome in (again, KeyboardInterrupt(search.NOTHING_TESTED)):
         found, _ = come_to(coarse, outcome)
-        assert found is coarse and found.interrupted == search.FINER and not found.is_complete and not found.departed
+        assert found is coarse and found.interrupted == search.FINER and not found.is_complete
+        assert found.notes[-1].startswith("what was found asks for 4 substeps a row")
+    later = search.Search(None, None, None, None, 0.0)
+    later.interrupt("fitting curves")
+    coarse.interrupted = ""
+    assert come_to(coarse, later)[0] is later
+
+
+def test_an_interrupt_while_steps_are_compared_ends_the_search(monkeypatch):
+    """Effects are tested then; no curve is fitted any more."""
+
+    def stopped(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(search, "_add_all", lambda *_: None)
+    monkeypatch.setattr(search, "_look_at_step", stopped)
+    monkeypatch.setattr(search, "_end", lambda *_: pytest.fail("it goes on"))
+    found = search._rounds(search.Search(None, None, None, None, 0.0, rounds=[quiet_round()]), None)
+    assert found.interrupted == search.FINER and found.cut_short
+
+
+@pytest.mark.parametrize("failure", [KeyboardInterrupt(), RuntimeError("the tide is out")])
+def test_what_was_found_stays_where_curves_cannot_be_fitted(monkeypatch, failure):
+    def stopped(*_):
+        raise failure
+
+    monkeypatch.setattr(search, "_curves", stopped)
+    found = search.Search(None, None, None, None, 0.0, rounds=2 * [quiet_round()])
+    found.found = 2 * [Found(Chosen("drag", 9.0), [], None)]
+    search._end(found, None)
+    if isinstance(failure, KeyboardInterrupt):
+        assert found.interrupted == "fitting curves"
+    else:
+        assert found.notes == ["no curve was fitted beside what was found: RuntimeError: the tide is out"]
+
+
+def test_a_curve_is_asked_only_of_what_a_filter_has_left(monkeypatch):
+    """Fitting one costs more than a filter."""
+    drag, bias = Chosen("drag", 30.0), Chosen("bias", 9.0)
+    drag.is_confirmed = bias.is_confirmed = False
+    asked = []
+
+    def admits(self, candidate):
+        asked.append((candidate.name, candidate.is_confirmed))
+        return True
+
+    def confirm(self, candidate):
+        return Chosen(candidate.name, 1.0 if candidate is drag else candidate.total)
+
+    screening = leading(monkeypatch, "drag bias")
+    monkeypatch.setattr(search.CurveJudge, "admits", admits)
+    monkeypatch.setattr(search.ParticleJudge, "confirm", confirm)
+    monkeypatch.setattr(search, "_refits", lambda *_: [drag, bias])
+    found = search.Search(None, base=None, final=None, step=None, gained=0.0)
+    assert search._add_best(found, screening, 1)
+    assert [one.candidate.name for one in found.found] == ["bias"] and asked == [("bias", True)]
 
 
 @pytest.mark.parametrize("outcome", [RuntimeError("the tide is out"), True, False])

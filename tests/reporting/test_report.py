@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -100,6 +101,18 @@ def test_one_run_alone_is_a_report_without_a_proof(runs, data, tmp_path):
         found.write(tmp_path / "none" / "report.html")
     with pytest.raises(st.UsageError, match="at least one run"):
         st.report({}, data)
+
+
+def test_it_begins_with_what_is_suspicious_in_the_table(found, runs, data):
+    assert "nothing is suspicious in them" in found.html
+    controls = data.controls.clone()
+    controls[..., 0] = 0.5
+    still = st.report({"only": runs["before"]}, replace(data, controls=controls), simulations=20, draws=5)
+    (one,) = still.table.findings
+    assert one.kind == "constant" and one.mend in still.html
+    assert (
+        still.html.index('<section id="table"') < still.html.index(one.mend) < still.html.index('<section id="verdict"')
+    )
 
 
 def test_a_system_that_is_no_vehicle_has_a_report(tmp_path):
