@@ -74,8 +74,9 @@ class Examination(Displayed):
             "index_col": False if "a separator at the end" in told else None,
         }
         more = "".join(f", {name}={value!r}" for name, value in given.items() if value not in ("", [], None))
-        labels = "dtype={'trajectory': str}, keep_default_na=False, na_values=['', 'nan', 'NaN']"
         names = ".rename(columns=str.strip)" if "blanks around" in told else ""
+        labels = "converters={0: str}" if names else "dtype={'trajectory': str}"  # the name has blanks in the file
+        labels += ", keep_default_na=False, na_values=['', 'nan', 'NaN']"
         return f"import numpy as np, pandas as pd; table = pd.read_csv({self.name!r}, {labels}{more}){names}"
 
     @property
