@@ -82,18 +82,18 @@ def read_drives(table: Path, program: "st.Program", known: Collection[str] = ())
     """The drives of a table; what is suspicious in it is said, but for the kinds that are `known` to be said later."""
     from steady_ppl.runs.diagnostics import doctor
 
-    hint = f"(`steady doctor {shlex.quote(str(table))}` says how to mend it)"
+    doctor_says = f"`steady doctor {shlex.quote(str(table))}` says how to mend it"
     try:
         drives = st.read_table(table)
     except DataError:
         with suppress(SteadyError):  # it cannot be examined either
             kinds = [one.kind for one in doctor(table, program).findings if one.kind not in ("refused", "units row")]
             if kinds:
-                say(f"{table.name}: suspicious are {', '.join(dict.fromkeys(kinds))} {hint}")
+                say(f"{table.name}: suspicious are {', '.join(dict.fromkeys(kinds))} ({doctor_says})")
         raise
     if found := [one for one in doctor(drives, program).findings if one.kind not in known]:
-        others = f"; {len(found) - 1} more" if len(found) > 1 else ""
-        say(f"{table.name}: {found[0]}{others} {hint}")
+        others = f"{len(found) - 1} more; " if len(found) > 1 else ""
+        say(f"{table.name}: {found[0]} ({others}{doctor_says})")
     return drives
 
 
