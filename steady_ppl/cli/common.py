@@ -85,12 +85,12 @@ def read_drives(table: Path, program: "st.Program", known: Collection[str] = ())
     doctor_says = f"`steady doctor {shlex.quote(str(table))}` says how to mend it"
     try:
         drives = st.read_table(table)
-    except DataError:
+    except DataError as error:
         with suppress(SteadyError):  # it cannot be examined either
-            kinds = [one.kind for one in doctor(table, program).findings if one.kind not in ("refused", "units row")]
-            if kinds:
-                say(f"{table.name}: suspicious are {', '.join(dict.fromkeys(kinds))} ({doctor_says})")
-        raise
+            if any(one.kind not in ("refused", "units row") for one in doctor(table, program).findings):
+                column, label, row = error.column, error.trajectory, error.row
+                error = DataError(f"{error} ({doctor_says})", column=column, trajectory=label, row=row)
+        raise error from None
     if found := [one for one in doctor(drives, program).findings if one.kind not in known]:
         others = f"{len(found) - 1} more; " if len(found) > 1 else ""
         say(f"{table.name}: {found[0]} ({others}{doctor_says})")
