@@ -13,7 +13,7 @@ from torch import Tensor
 from steady_ppl import Constant, Joint, LookaheadGuide, Program, Trajectories, for_program, seeded
 from steady_ppl.gaussian.linearize import ReferencePath
 from steady_ppl.gaussian.smoother import standard_noise
-from steady_ppl.guides.base import true_paths
+from steady_ppl.guides.path_guides import true_paths
 
 RESAMPLED = 200
 

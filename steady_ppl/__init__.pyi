@@ -28,17 +28,17 @@ from .errors import (
 )
 from .gaussian.linearize import why_not_linear as why_not_linear
 from .gaussian.single_row_map import fixes as fixes
-from .guides.base import (
+from .guides.linearized import (
+    GaussianGuide as GaussianGuide,
+    LookaheadGuide as LookaheadGuide,
+    SmootherGuide as SmootherGuide,
+)
+from .guides.path_guides import (
     Constant as Constant,
     LinearRamp as LinearRamp,
     PathGuide as PathGuide,
     SMCGuide as SMCGuide,
     TruthGuide as TruthGuide,
-)
-from .guides.linearized import (
-    GaussianGuide as GaussianGuide,
-    LookaheadGuide as LookaheadGuide,
-    SmootherGuide as SmootherGuide,
 )
 from .guides.variational import (
     AutoRollout as AutoRollout,

@@ -80,18 +80,16 @@ def program_from(model: str, seed: int, substeps: int | None = None) -> "st.Prog
 
 def read_drives(table: Path, program: "st.Program", known: Collection[str] = ()) -> "st.Trajectories":
     """The drives of a table; what is suspicious in it is said, but for the kinds that are `known` to be said later."""
-    from steady_ppl.runs.diagnostics import doctor
-
     doctor_says = f"`steady doctor {shlex.quote(str(table))}` says how to mend it"
     try:
         drives = st.read_table(table)
     except DataError as error:
         with suppress(SteadyError):  # it cannot be examined either
-            if any(one.kind not in ("refused", "units row") for one in doctor(table, program).findings):
+            if any(one.kind not in ("refused", "units row") for one in st.doctor(table, program).findings):
                 column, label, row = error.column, error.trajectory, error.row
                 error = DataError(f"{error} ({doctor_says})", column=column, trajectory=label, row=row)
         raise error from None
-    if found := [one for one in doctor(drives, program).findings if one.kind not in known]:
+    if found := [one for one in st.doctor(drives, program).findings if one.kind not in known]:
         others = f"{len(found) - 1} more; " if len(found) > 1 else ""
         say(f"{table.name}: {found[0]} ({others}{doctor_says})")
     return drives

@@ -12,9 +12,9 @@ from steady_ppl.cli import common
 from steady_ppl.cli.common import load_runs, present, program_from, read_drives, run_labels, runs_and_table, used_before
 from steady_ppl.errors import UsageError
 from steady_ppl.utils.files import require_picture, require_place, write_picture
-from steady_ppl.utils.text import say, tell
+from steady_ppl.utils.text import counted, say, tell
 
-SAID_LATER = ("degrees", "frozen", "outlier")  # by `check` itself
+SAID_BY_CHECK = ("degrees", "frozen", "outlier")  # kinds of findings
 MIN_SHARE_OF_POOR_ROWS = 0.1  # share of the measured rows after which hardly a particle is left
 SIMULATIONS = 100  # sets for the bands of a report
 
@@ -25,10 +25,8 @@ def doctor(
     json_file: common.Json = None,
 ) -> None:
     """Say what is suspicious in a table, before anything is fitted, and the line that mends it."""
-    from steady_ppl.runs.diagnostics import doctor
-
     require_place(json_file)
-    found = doctor(table, None if model is None else program_from(model, 0))
+    found = st.doctor(table, None if model is None else program_from(model, 0))
     present(str(found), found.figures, json_file)
 
 
@@ -59,7 +57,7 @@ def check(
         if os.path.realpath(mask) in (os.path.realpath(table), json_file and os.path.realpath(json_file)):
             raise UsageError(f"--mask {mask} is the table itself, or the file of --json: name another file")
     fit = st.Fit.load(run, program)
-    drives = read_drives(table, fit.program, SAID_LATER)
+    drives = read_drives(table, fit.program, SAID_BY_CHECK)
     found = st.check(fit, drives, simulations=simulations, seed=seed)
     if picture is not None:
         from steady_ppl.plotting.check import check_picture
@@ -70,7 +68,7 @@ def check(
         st.write_table(found.outliers.without(without_stretches(drives, found.stuck)), mask)
         count, cells = len(found.stuck), found.outliers.cells
         stretches = f"{count} stretch{'' if count == 1 else 'es'} that nobody measured"
-        say(f"{mask}: {table.name} without {stretches} and {cells} wrong reading{'' if cells == 1 else 's'}")
+        say(f"{mask}: {table.name} without {stretches} and {counted(cells, 'wrong reading')}")
 
 
 def prove(

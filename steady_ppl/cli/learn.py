@@ -15,7 +15,8 @@ from steady_ppl.utils.files import require_picture, require_place, write_picture
 from steady_ppl.utils.text import say, shown, tell
 
 LITERALS = {"true": True, "false": False, "none": None}
-SAID_LATER = ("degrees",)  # by what learns, in its notes
+SAID_IN_NOTES = ("degrees",)  # kinds of findings, which a fit says itself
+SAID_BY_DISCOVER = (*SAID_IN_NOTES, "constant")
 RECIPES = ("steady", "likelihood", "steady-minus", "svi", "hand", "fit-hand", "fit-tv", "fit-truth")
 GuideName = Literal["lookahead", "gaussian", "bootstrap", "network", "mean-field", "smoother"]
 
@@ -60,7 +61,7 @@ def fit(
     result = run_recipe(
         recipe,
         program,
-        read_drives(table, program, SAID_LATER),
+        read_drives(table, program, SAID_IN_NOTES),
         st.read_table(valid) if valid else None,
         out,
         options=_settings(setting or [], {name: value for name, value in given.items() if value is not None}),
@@ -144,7 +145,7 @@ def discover(
     require_picture(picture)
     require_place(json_file)
     given = fit_or_program(source, program, seed, substeps)
-    drives = read_drives(table, given.program if isinstance(given, st.Fit) else given, (*SAID_LATER, "constant"))
+    drives = read_drives(table, given.program if isinstance(given, st.Fit) else given, SAID_BY_DISCOVER)
     judges = st.read_table(valid) if valid else None
     settings: dict[str, Any] = {"known_start": known_start, "mix": mix, "simulations": simulations, "seed": seed}
     settings |= {"withheld": withhold or [], "only": only or []}

@@ -6,19 +6,20 @@ It rests on the table alone, and on the units and the step of a program where on
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 
+from steady_ppl.data.dialect import Dialect
 from steady_ppl.data.frozen_sensors import frozen_stretches
-from steady_ppl.data.suspicions import LOOKS, Array, Columns, Suspicion, cell, counted
-from steady_ppl.data.table import from_frame, parse_cells, read_cells, to_frame
+from steady_ppl.data.suspicions import LOOKS, Array, Columns, Suspicion, cell
+from steady_ppl.data.table import fail, from_frame, labels_of, parse_cells, read_cells, to_frame
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.errors import DataError
 from steady_ppl.utils.context import UNITS_ROW, Displayed
-from steady_ppl.utils.text import shown
+from steady_ppl.utils.text import counted, shown
 
 OF_DATES = (
     'table["time"] = (pd.to_datetime(table["time"], utc=True, format="ISO8601") - pd.Timestamp(0, tz="UTC")) '
@@ -37,14 +38,14 @@ class Examination(Displayed):
     rows: int
     trajectories: int
     findings: list[Suspicion]
-    dialect: list[str] = field(default_factory=list)  # how the file was written, which did no harm
+    dialect: Dialect = field(default_factory=Dialect)  # how the file was written, which did no harm
 
     def __str__(self) -> str:
         count = len(self.findings)
-        found = "nothing is suspicious" if not count else f"{count} finding{'s' if count > 1 else ''}"
+        found = "nothing is suspicious" if not count else counted(count, "finding")
         drives = "1 trajectory" if self.trajectories == 1 else f"{self.trajectories} trajectories"
         lines = [f"{self.name}: {drives}, {counted(self.rows, 'row')}; {found}."]
-        lines += [f"Read with {', '.join(self.dialect)}."] if self.dialect else []
+        lines += [f"Read with {', '.join(self.dialect.notes)}."] if self.dialect.notes else []
         for number, one in enumerate(self.findings[:MAX_SHOWN], 1):
             lines += ["", f"{number}. {one}", f"   {one.mend}"]
         if count > MAX_SHOWN:
@@ -63,38 +64,19 @@ class Examination(Displayed):
             return f"import numpy as np, pandas as pd; table = pd.read_parquet({self.name!r})"
         if not self.name.endswith(".csv"):
             return "import numpy as np, pandas as pd"
-        told = " ".join(self.dialect)
-        comments = int(told.split(" comment line")[0].split()[-1]) if " comment line" in told else 0
-        skipped = [*range(comments), *([comments + 1] if "a row of units" in told else [])]
-        given = {
-            "sep": ";" if "semicolons" in told else "\t" if "tabs" in told else "",
-            "decimal": "," if "decimal commas" in told else "",
-            "encoding": "utf-16" if "UTF-16" in told else "",
-            "skiprows": skipped,
-            "index_col": False if "a separator at the end" in told else None,
-        }
-        more = "".join(f", {name}={value!r}" for name, value in given.items() if value not in ("", [], None))
-        names = ".rename(columns=str.strip)" if "blanks around" in told else ""
-        labels = "converters={0: str}" if names else "dtype={'trajectory': str}"  # the name has blanks in the file
-        labels += ", keep_default_na=False, na_values=['', 'nan', 'NaN']"
-        return f"import numpy as np, pandas as pd; table = pd.read_csv({self.name!r}, {labels}{more}){names}"
+        labels = "dtype={'trajectory': str}"
+        if self.dialect.has_blanks:  # also the name of the labels
+            labels = "converters={0: str}"
+        given = "".join(f", {name}={value!r}" for name, value in self.dialect.for_pandas.items())
+        given = f"{labels}, keep_default_na=False, na_values=['', 'nan', 'NaN']{given}"
+        names = ".rename(columns=str.strip)" if self.dialect.has_blanks else ""
+        return f"import numpy as np, pandas as pd; table = pd.read_csv({self.name!r}, {given}){names}"
 
     @property
     def figures(self) -> dict[str, object]:
         """Everything as a plain dict, ready for JSON."""
-        found = [
-            {
-                "kind": one.kind,
-                "column": one.column,
-                "trajectories": list(one.trajectories),
-                "cells": one.cells,
-                "why": one.why,
-                "mend": one.mend,
-            }
-            for one in self.findings
-        ]
         shape = {"table": self.name, "rows": self.rows, "trajectories": self.trajectories}
-        return {**shape, "dialect": self.dialect, "findings": found}
+        return {**shape, "dialect": self.dialect.notes, "findings": [asdict(one) for one in self.findings]}
 
 
 def examine(
@@ -111,7 +93,7 @@ def examine(
     Raises:
         DataError: the file cannot be read, or has other columns.
     """
-    dialect, name = list[str](), "table"
+    dialect, name = Dialect(), "table"
     if isinstance(table, Trajectories):
         frame = to_frame(table)
     elif isinstance(table, pd.DataFrame):
@@ -129,9 +111,9 @@ def examine(
             where = () if error.trajectory is None else (error.trajectory,)
             why = str(error).partition(": ")[2]
             findings.append(Suspicion("refused", None, where, 1, why, "mend the table by hand there"))
-    unit_row = next((one for one in dialect if one.startswith("a row of units")), None)
-    if unit_row is not None and not UNITS_ROW.get():
-        findings.insert(0, Suspicion("units row", None, (), 1, f"row 1 is {unit_row}", "read it with --units-row"))
+    if dialect.units is not None and not UNITS_ROW.get():
+        why = f"row 1 is a row of units ({dialect.units})"
+        findings.insert(0, Suspicion("units row", None, (), 1, why, "read it with --units-row"))
     return Examination(name, len(frame), len(set(numbers.labels)), findings, dialect)
 
 
@@ -141,12 +123,12 @@ def _numbers(
     """The cells as numbers, and which are none."""
     for required in ("trajectory", "time"):
         if required not in frame.columns:
-            raise DataError(f"{name}: column {required}: this column is missing", column=required)
-    if (twice := frame.columns[frame.columns.duplicated()]).size:
-        raise DataError(f"{name}: column {twice[0]}: this column appears twice", column=str(twice[0]))
+            fail(name, "this column is missing", column=required)
+    for twice in frame.columns[frame.columns.duplicated()][:1]:
+        fail(name, "this column appears twice", column=str(twice))
     if not len(frame):
-        raise DataError(f"{name}: the table has no rows")
-    labels = frame["trajectory"].astype(str).to_numpy()
+        fail(name, "the table has no rows")
+    labels, _ = labels_of(frame["trajectory"])
     starts = np.append(True, labels[1:] != labels[:-1])
     run, findings, values = starts.cumsum() - 1, list[Suspicion](), dict[str, Array]()
     for column in frame.columns:
@@ -187,8 +169,10 @@ def _frozen(data: Trajectories, table: Columns) -> Iterator[Suspicion]:
     def is_hung(name: str, drive: int, first: int, last: int) -> bool:
         values, rows = table.values[name], slice(begins[drive] + first, begins[drive] + last + 1)
         here, every = values[rows], values[np.isfinite(values)]
-        if not len(every) or not np.isfinite(here).any() or np.nanmax(here) > np.nanmin(here):
-            return bool(len(every)) and bool(np.isfinite(here).any())
+        if not np.isfinite(here).any():  # codes, which are said already
+            return False
+        if np.nanmax(here) > np.nanmin(here):
+            return True
         is_at_end = here[0] in (every.min(), every.max())
         others = [table.values[one][rows] for one in seen if one != name]
         is_still = all(np.isfinite(one).sum() < 2 or np.nanmax(one) == np.nanmin(one) for one in others)

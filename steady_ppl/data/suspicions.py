@@ -15,7 +15,7 @@ from itertools import combinations, pairwise
 import numpy as np
 import pandas as pd
 
-from steady_ppl.utils.text import shown
+from steady_ppl.utils.text import counted, shown
 
 Array = np.ndarray
 CODES = (-9999.0, -999.0, -99.0, 999.0, 9999.0, 99999.0, -99999.0, 32767.0, -32768.0, 65535.0, 2147483647.0, 1e9, 1e30)
@@ -27,6 +27,7 @@ USUAL = 0.95  # quantile of a column's steps
 OUTLIER_JUMP = 25.0  # of the median step, to a wrong reading and back
 MAX_JUMP_ROWS = 15  # of a wrong reading that lasts
 MAX_RADIANS = 5 * math.pi  # rad; beyond it a reading on a circle looks like degrees
+MAX_DEGREES = 361.0  # a circle, rounded
 MIN_SHARE_OF_DEGREES = 0.05  # of the cells that are beyond one turn in radians
 EPOCHS = ((1e17, "nanoseconds", 1e9), (1e14, "microseconds", 1e6), (1e11, "milliseconds", 1e3))  # since 1970
 LONG_STEPS = ((1e6, "nanoseconds", 1e9), (1e3, "microseconds", 1e6), (20.0, "milliseconds", 1e3))  # from a step on
@@ -61,11 +62,6 @@ NORTHS = {"x": "y", "east": "north", "easting": "northing"}
 def cell(name: str) -> str:
     """A column of the table in a line for pandas."""
     return f"table[{json.dumps(name, ensure_ascii=False)}]"
-
-
-def counted(count: int, noun: str) -> str:
-    """How many there are."""
-    return f"{count} {noun}{'' if count == 1 else 's'}"
 
 
 @dataclass(frozen=True)
@@ -383,16 +379,21 @@ def _line(a: Array, b: Array) -> tuple[float, float]:
     return slope, float(b.mean() - slope * a.mean())
 
 
+def are_degrees(seen: Array, min_share: float = 0.0) -> bool:
+    """Whether angles, none of them missing, reach farther than radians would and no farther than a circle, and more
+    than a share of them lies beyond one turn in radians."""
+    sizes = np.abs(seen)
+    is_far = len(sizes) > 0 and MAX_RADIANS < float(sizes.max()) <= MAX_DEGREES
+    return is_far and float((sizes > 2 * math.pi).mean()) > min_share
+
+
 def _degrees(table: Columns) -> Iterator[Suspicion]:
     """Angles that look like degrees where radians are read."""
     for name in table.of("u.", "y.", "x."):
         values = table.values[name]
         looked_at = values[table.begins] if name.startswith("x.") else values  # later states may have counted turns
         seen = looked_at[np.isfinite(looked_at)]
-        sizes = np.abs(seen)
-        if not table.is_angle(name) or not len(seen) or not MAX_RADIANS < float(sizes.max()) <= 361:
-            continue
-        if float((sizes > 2 * math.pi).mean()) > MIN_SHARE_OF_DEGREES:
+        if table.is_angle(name) and are_degrees(seen, MIN_SHARE_OF_DEGREES):
             why = f"it is between {seen.min():.4g} and {seen.max():.4g}, and angles are radians: are these degrees?"
             yield Suspicion("degrees", name, (), len(seen), why, f"{cell(name)} *= np.pi / 180")
             table.values[name] = np.deg2rad(values)
@@ -407,10 +408,9 @@ def _headings(table: Columns) -> Iterator[Suspicion]:
             continue
         swapped = _is_swapped(table, east, north)
         if swapped:
-            mend = f'table = table.rename(columns={{"{east}": "{north}", "{north}": "{east}"}})'
-            yield Suspicion(
-                "axes", east, (), len(table.run), f"it goes with {swapped}: are {east} and {north} swapped?", mend
-            )
+            mend = f"table = table.rename(columns={json.dumps({east: north, north: east}, ensure_ascii=False)})"
+            why = f"it goes with {swapped}: are {east} and {north} swapped?"
+            yield Suspicion("axes", east, (), len(table.run), why, mend)
             continue
         for heading in (name for name in table.of("y.") if HEADING.search(name)):
             yield from _against_course(table, east, north, heading)
@@ -428,9 +428,8 @@ def _is_swapped(table: Columns, east: str, north: str) -> str | None:
 
     def agreement(one: str, other: str) -> float:
         both = np.isfinite(table.values[one]) & np.isfinite(table.values[other])
-        return (
-            float(np.mean(np.abs(table.values[one][both] - table.values[other][both]))) if both.sum() > 20 else math.nan
-        )
+        apart = np.abs(table.values[one][both] - table.values[other][both])
+        return float(apart.mean()) if len(apart) > 2 * MIN_CELLS else math.nan
 
     straight = agreement(east, "x.x") + agreement(north, "x.y")
     across = agreement(east, "x.y") + agreement(north, "x.x")

@@ -21,7 +21,7 @@ import pyarrow.parquet
 import torch
 from torch import Tensor
 
-from steady_ppl.data.dialect import read_csv
+from steady_ppl.data.dialect import Dialect, read_csv
 from steady_ppl.data.trajectories import Trajectories, pad, pad_time
 from steady_ppl.errors import DataError, TableWarning, require
 from steady_ppl.utils.context import UNITS_ROW
@@ -45,22 +45,22 @@ def read_table(path: str | Path, *, units_row: bool | None = None) -> Trajectori
         DataError: naming the file and, where they apply, the column, the trajectory and the row.
     """
     path = Path(path)
-    frame, told = read_cells(path, UNITS_ROW.get() if units_row is None else units_row)
+    frame, dialect = read_cells(path, UNITS_ROW.get() if units_row is None else units_row)
     data = from_frame(frame, name=path.name)
-    if told:
-        warnings.warn(f"{path.name}: read with {', '.join(told)}", TableWarning, stacklevel=2)
+    if dialect.notes:
+        warnings.warn(f"{path.name}: read with {', '.join(dialect.notes)}", TableWarning, stacklevel=2)
     return data
 
 
-def read_cells(path: Path, units_row: bool | None) -> tuple[pd.DataFrame, list[str]]:
-    """The cells of a `.csv` or `.parquet` file, and how a CSV was written, see `read_table`.
+def read_cells(path: Path, units_row: bool | None) -> tuple[pd.DataFrame, Dialect]:
+    """The cells of a `.csv` or `.parquet` file, and how a CSV is written, see `read_table`.
 
     Args:
         units_row: the row below the header of a CSV has units; None: if it looks like one.
     """
     require_file(path, DataError)
     try:
-        return read_csv(path, units_row) if _suffix(path) == ".csv" else (_read_parquet(path), [])
+        return read_csv(path, units_row) if _suffix(path) == ".csv" else (_read_parquet(path), Dialect())
     except FileNotFoundError as error:
         raise DataError(f"{path.name}: there is no such file") from error
     except (OSError, ValueError, csv.Error, pyarrow.ArrowException) as error:
@@ -181,11 +181,7 @@ def _trajectories(cells: pd.Series, name: str) -> tuple[np.ndarray, np.ndarray]:
     """The labels in order of first appearance and the trajectories' numbers of rows."""
     if len(cells) == 0:
         fail(name, "the table has no rows")
-    whole = pd.api.types.is_float_dtype(cells.dtype) and bool((cells.dropna() % 1 == 0).all())  # numbers with a gap
-    codes, different = pd.factorize(cells, use_na_sentinel=False)
-    named = np.array([f"{cell:.0f}" if whole else str(cell) for cell in different], dtype=object)
-    is_empty = pd.isna(different) | np.array([not label.strip() for label in named], dtype=bool)
-    labels, empty = named[codes], is_empty[codes]
+    labels, empty = labels_of(cells)
     if empty.any():
         fail(name, "got an empty cell, expected a label", column="trajectory", row=int(empty.argmax()) + 1)
     starts = np.flatnonzero(np.append(True, labels[1:] != labels[:-1]))
@@ -198,6 +194,15 @@ def _trajectories(cells: pd.Series, name: str) -> tuple[np.ndarray, np.ndarray]:
         for i in np.flatnonzero(bad)[:1].tolist():
             fail(name, problem, column="trajectory", trajectory=labels[i], row=int(starts[i]) + 1)
     return labels, lengths
+
+
+def labels_of(cells: pd.Series) -> tuple[np.ndarray, np.ndarray]:
+    """The label of every row as text, and which are empty."""
+    whole = pd.api.types.is_float_dtype(cells.dtype) and bool((cells.dropna() % 1 == 0).all())  # numbers with a gap
+    codes, different = pd.factorize(cells, use_na_sentinel=False)
+    named = np.array([f"{cell:.0f}" if whole else str(cell) for cell in different], dtype=object)
+    is_empty = pd.isna(different) | np.array([not label.strip() for label in named], dtype=bool)
+    return named[codes], is_empty[codes]
 
 
 def finite_numbers(

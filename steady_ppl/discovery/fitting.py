@@ -25,8 +25,8 @@ from steady_ppl.errors import FilterError
 from steady_ppl.gaussian.information_filter import Lookahead
 from steady_ppl.gaussian.linearize import ReferencePath
 from steady_ppl.gaussian.smoother import require_found, resting_path, smooth
-from steady_ppl.guides.base import Constant
 from steady_ppl.guides.linearized import LookaheadGuide
+from steady_ppl.guides.path_guides import Constant
 from steady_ppl.likelihood.evidence import neglected
 from steady_ppl.likelihood.maximize import Maximum, kept_maximum, maximise_each, maximise_sum, output_of
 from steady_ppl.likelihood.objective import Term

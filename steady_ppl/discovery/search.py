@@ -189,7 +189,7 @@ def _end(found: Search, settings: Settings) -> None:
     except KeyboardInterrupt:
         found.interrupt("fitting curves")
     except Exception as error:  # also of the program's own code
-        found.notes.append(f"no curve was fitted beside what was found: {reason_of(error)}")
+        found.notes.append(f"curves and corrections were not looked at to the end: {reason_of(error)}")
 
 
 def _drop_corrections(found: Search, settings: Settings) -> None:

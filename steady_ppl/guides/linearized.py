@@ -12,7 +12,7 @@ from steady_ppl.gaussian.information_filter import Lookahead, Steering
 from steady_ppl.gaussian.linearize import ReferencePath
 from steady_ppl.gaussian.smoother import find_and_smooth, require_found, resting_path, smooth, smoother_paths
 from steady_ppl.gaussian.twisted_proposal import Twist
-from steady_ppl.guides.base import FilteringGuide, LinearRamp, PathGuide, Tempering
+from steady_ppl.guides.path_guides import FilteringGuide, LinearRamp, PathGuide, Tempering
 from steady_ppl.guides.variational import VariationalGuide, log_ratio, times
 from steady_ppl.model.problem import Problem
 from steady_ppl.model.program import Program

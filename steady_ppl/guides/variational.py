@@ -21,7 +21,7 @@ from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.errors import UsageError, require
 from steady_ppl.gaussian.predict import on_a_circle
 from steady_ppl.gaussian.smoother import find_and_smooth
-from steady_ppl.guides.base import Constant, Tempering, sample_known
+from steady_ppl.guides.path_guides import Constant, Tempering, sample_known
 from steady_ppl.likelihood.scores import channel_moments
 from steady_ppl.model.handlers import KnownStart, Recording, Replaying, Standardised, Substituting, running
 from steady_ppl.model.problem import Problem

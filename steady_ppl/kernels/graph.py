@@ -20,7 +20,7 @@ from steady_ppl.errors import SteadyError
 PARAMETERS_ALONE, TRAJECTORY, PARTICLE = range(3)  # what a value depends on
 LEAVES = ("input", "parameter", "constant", "element")
 MAX_UNROLLED_ELEMENTS = 48  # of the largest matrix whose product is written out element by element
-MAX_OPERATIONS = 12_000  # scalar operations: compiling so many takes as long as four passes over the drives without
+MAX_OPERATIONS = 12_000  # scalar operations: compiling so many takes as long as four passes over 2,400 rows without
 ZERO_DERIVATIVE = {"round", "floor", "ceil", "sign", "gt", "ge", "lt", "le", "eq", "ne"}  # their derivatives are zero
 ZERO_DERIVATIVE |= {"logical_and", "logical_or", "logical_not"}
 Values = list[int]  # a scalar, or the elements of a vector

@@ -8,6 +8,7 @@ from pyro.distributions import constraints
 from torch import Tensor
 
 from steady_ppl.data.doctor import Examination, examine
+from steady_ppl.data.suspicions import are_degrees
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.model.program import Program, parameter_name
 from steady_ppl.runs.fit import Fit
@@ -22,7 +23,6 @@ COLLAPSED = (
     "something else in the program explains too much; set it back in the program's file and fit again before anything "
     "is tested"
 )
-MAX_RADIANS = 5 * math.pi  # rad; beyond it a reading on a circle looks like degrees
 
 
 def diagnose_fit(fit: Fit, declared: Mapping[str, Tensor]) -> list[str]:
@@ -95,7 +95,7 @@ def diagnose_units(program: Program, data: Trajectories) -> list[str]:
 
 
 def _degrees(column: str, unit: str, seen: Tensor) -> list[str]:
-    if not len(seen) or not MAX_RADIANS < float(seen.abs().max()) <= 360:
+    if not are_degrees(seen.numpy()):
         return []
     between = f"{float(seen.min()):.4g} and {float(seen.max()):.4g}"
     read = "radians" if unit == "rad" else "radians a second"

@@ -62,6 +62,11 @@ def say(*remarks: str, always: bool = False) -> None:
         tell("\n".join([f"steady: {part}" for part in lines[:1]] + lines[1:]), aside=True)
 
 
+def counted(count: int, noun: str) -> str:
+    """How many there are of something whose plural ends in s."""
+    return f"{count} {noun}{'' if count == 1 else 's'}"
+
+
 def figure(value: float | None, form: str) -> str:
     """A figure as text, a dash where there is none."""
     return "–" if value is None else f"{value:{form}}"

@@ -327,7 +327,7 @@ def test_what_was_found_stays_where_curves_cannot_be_fitted(monkeypatch, failure
     if isinstance(failure, KeyboardInterrupt):
         assert found.interrupted == "fitting curves"
     else:
-        assert found.notes == ["no curve was fitted beside what was found: RuntimeError: the tide is out"]
+        assert found.notes == ["curves and corrections were not looked at to the end: RuntimeError: the tide is out"]
 
 
 def test_a_curve_is_asked_only_of_what_a_filter_has_left(monkeypatch):

@@ -16,7 +16,7 @@ from inference import steady as recipe
 from steady_ppl import Fit, Joint, UsageError, load_program, simulate
 from steady_ppl.effects import attached, chosen_variant, record
 from steady_ppl.effects.attach import SD_OF_LOG_FACTOR
-from steady_ppl.guides.base import true_paths
+from steady_ppl.guides.path_guides import true_paths
 from steady_ppl.model.handlers import Recording, Replaying
 from steady_ppl.model.substeps import acting_controls, sample_row
 from steady_ppl.model.validate import probe

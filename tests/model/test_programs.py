@@ -14,7 +14,7 @@ from pyro.infer import Trace_ELBO
 from small import HOVERCRAFT, TRUTH, simulated, steady, written
 
 from steady_ppl import Joint, TruthGuide, for_program, load_program, simulate
-from steady_ppl.guides.base import true_paths
+from steady_ppl.guides.path_guides import true_paths
 from steady_ppl.model.handlers import Recording, Replaying
 from steady_ppl.model.program import names
 from steady_ppl.model.substeps import acting_controls, sample_row

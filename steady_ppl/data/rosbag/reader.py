@@ -24,7 +24,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from steady_ppl.data.rosbag.mapping import Steps
 from steady_ppl.errors import DataError, SteadyError, UsageError
 from steady_ppl.utils.files import require_file
-from steady_ppl.utils.text import one_line
+from steady_ppl.utils.text import counted, one_line
 
 FIELD_LIST_COLUMNS = 110  # characters of a list of fields
 TEXT_TYPES = ("string", "wstring", "wchar")
@@ -301,7 +301,7 @@ def _of_bag(bag: Bag, sections: dict[tuple[str, str], list[str]]) -> list[str]:
         types, gaps = bag.types(topic), np.diff(np.sort(np.array(at, dtype=np.int64)))
         middle = float(np.median(gaps)) if len(gaps) else 0.0
         rate = f"  {1e9 / middle:.4g} Hz" if middle > 0 else ""
-        lines += ["#", f"# {topic}  {' and '.join(types)}  {len(at)} message{'' if len(at) == 1 else 's'}{rate}"]
+        lines += ["#", f"# {topic}  {' and '.join(types)}  {counted(len(at), 'message')}{rate}"]
         if missing := next(filter(None, (undefined_type(bag.store, one) for one in types)), None):
             lines.append(
                 f'#     {missing} is not defined: name its file, messages = ["PACKAGE/msg/NAME.msg"], in the mapping'

@@ -32,7 +32,7 @@ from steady_ppl import (
     simulate,
     stack,
 )
-from steady_ppl.guides.base import true_paths
+from steady_ppl.guides.path_guides import true_paths
 from steady_ppl.model.handlers import Replaying, running
 from steady_ppl.model.substeps import sample_row
 
