@@ -122,12 +122,13 @@ class Lookahead:
     def path(self, data: Trajectories) -> ReferencePath:
         """The posterior mean as a path to linearise along."""
         has_tails = self.linearization.path.variance is not None
-        return ReferencePath.of_means(*self.means(), data, self.sensed_variance() if has_tails else None)
+        return ReferencePath.of_means(*self.means(), data, self.sensed_variance if has_tails else None)
 
+    @cached_property
     def sensed_variance(self) -> Tensor:
         """Posterior variance of what each measurement sees, to first order, `(T + 1, B, K)`; zero if missing."""
         seen = self.linearization.precision > 0
-        by_state, states = self.linearization.measurement[seen], self._tensor(self.covariances_in_lanes()[0])
+        by_state, states = self.linearization.measurement[seen], self._tensor(self.covariances_in_lanes[0])
         rows, drives, _ = seen.nonzero(as_tuple=True)
         across = (states[rows, drives] @ by_state.unsqueeze(-1)).squeeze(-1)
         return torch.zeros_like(self.linearization.precision).masked_scatter(seen, (across * by_state).sum(-1))
@@ -161,9 +162,10 @@ class Lookahead:
     def covariances(self) -> tuple[Tensor, Tensor, Tensor]:
         """Posterior covariances on the path's own turn: of the states, `(T + 1, B, D, D)`, of the noise of each
         interval, `(T, B, C, C)`, and of the state that it moves with it, `(T, B, D, C)`."""
-        states, noises, across = (self._tensor(part) for part in self.covariances_in_lanes())
+        states, noises, across = (self._tensor(part) for part in self.covariances_in_lanes)
         return states, noises, across
 
+    @cached_property
     def covariances_in_lanes(self) -> tuple[Array, Array, Array]:
         spread = self.linearization.start_noise @ self.starts.factor[0]
         return covariances(self.given, self.steering, in_lanes(spread @ spread.mT))

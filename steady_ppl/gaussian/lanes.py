@@ -28,9 +28,16 @@ def array(tensor: Tensor) -> Array:
 def in_lanes(matrices: Tensor) -> Array:
     """`(..., B, R, C)` as `(..., blocks, R, C, LANES)` in the host's memory, the last block filled with zeros."""
     lanes = LANES if matrices.shape[-3] > 2 else 1  # blocks of mostly zeros would be no faster
-    if missing := -matrices.shape[-3] % lanes:
-        matrices = torch.nn.functional.pad(matrices, (0, 0, 0, 0, 0, missing))
-    return matrices.unflatten(-3, (-1, lanes)).movedim(-3, -1).contiguous().numpy(force=True)
+    *left, count, rows, columns = matrices.shape
+    full, rest = divmod(count, lanes)
+    whole = matrices[..., : full * lanes, :, :].unflatten(-3, (full, lanes)).movedim(-3, -1)
+    if not rest:
+        return whole.contiguous().numpy(force=True)
+    blocks = matrices.new_empty((*left, full + 1, rows, columns, lanes))
+    blocks[..., :full, :, :, :] = whole
+    blocks[..., full, :, :, :rest] = matrices[..., full * lanes :, :, :].movedim(-3, -1)
+    blocks[..., full, :, :, rest:] = 0.0
+    return blocks.numpy(force=True)
 
 
 def out_of_lanes(blocks: Array, trajectories: int) -> Tensor:

@@ -101,7 +101,7 @@ def posterior_moments(ahead: Lookahead, data: Trajectories) -> Posterior:
     states = linear.path.states + out_of_lanes(moved, drives).squeeze(-1).to(device)
     states = torch.where(data.rows.unsqueeze(-1), states, states[:1])
     means = states.movedim(-1, 0).contiguous().numpy(force=True)
-    lag, spread = np.zeros(along), ahead.covariances_in_lanes()
+    lag, spread = np.zeros(along), ahead.covariances_in_lanes
     measured.points[:, : len(cells.rows)] = means.reshape(dimension, -1)[:, cells.rows.numpy(force=True)]
     below = len(cells.row)  # from x̂ + v to x̂ − v
     fill_moments(ahead.given, ahead.steering, (moved, noise), spread, means, driven, measured, places, below, lag)

@@ -143,10 +143,11 @@ def _penalty(ahead: Lookahead, moved: ReferencePath) -> Tensor:
     unit of a defect must cost for none to be worth it."""
     linear = ahead.linearization
     away = (moved.states - linear.path.states).double().unsqueeze(-1)
-    apart = linear.residual.unsqueeze(-1) - linear.measurement @ away
-    now = linear.measurement.mT @ (linear.precision.unsqueeze(-1) * apart)
-    later = ahead.information.unsqueeze(-1) - ahead.precision @ away
-    return 2 * (now + later).squeeze(-1).abs()
+    pull, seen = ahead.information.unsqueeze(-1) - ahead.precision @ away, (linear.precision > 0).any(-1)
+    by_state = linear.measurement[seen]
+    apart = linear.residual[seen].unsqueeze(-1) - by_state @ away[seen]
+    pull[seen] += by_state.mT @ (linear.precision[seen].unsqueeze(-1) * apart)
+    return 2 * pull.squeeze(-1).abs()
 
 
 def _share_of_step(step: Tensor, last: Tensor, share: Tensor) -> Tensor:

@@ -234,7 +234,7 @@ class _Robust:
         linear, (means, _) = self.linear, self.ahead.means()
         away = (means - linear.path.states).double()
         apart = linear.residual - (linear.measurement @ away.unsqueeze(-1)).squeeze(-1)
-        left = (1 - linear.precision * self.ahead.sensed_variance()).clamp(min=1e-9)
+        left = (1 - linear.precision * self.ahead.sensed_variance).clamp(min=1e-9)
         return torch.where(linear.precision > 0, apart * (linear.precision / left).sqrt(), 0.0)
 
     @property

@@ -27,6 +27,7 @@ from torch import Tensor
 
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.gaussian.information_filter import Lookahead
+from steady_ppl.gaussian.linearize import has_heavy_tails
 from steady_ppl.gaussian.posterior_moments import Cells, posterior_moments
 from steady_ppl.kernels.rows import Slopes, slopes_on_all_rows
 from steady_ppl.likelihood.parameters import Element, moved, on_both_sides
@@ -421,8 +422,9 @@ def of_actuators(program: Program, data: Trajectories, parts: Sequence[Element])
 
 def _of_measurements(program: Program, at: Smoothed, parts: list[Element]) -> Tensor:
     """The parameters' part in what is measured, `(B, P)`."""
-    points, found, here = at.measurements.points, at.measurements, measured(program, at.states)
-    of_tails = _of_tails(here, at) if here.heavy_tailed else torch.zeros_like(found.mean)
+    points, found, of_tails = at.measurements.points, at.measurements, torch.zeros_like(at.measurements.mean)
+    if has_heavy_tails(program, at.states[:1, :1]):
+        of_tails = _of_tails(program, at)
 
     def readings(state: Tensor) -> Tensor:
         there = measured(program, state)
@@ -449,12 +451,17 @@ def _of_measurements(program: Program, at: Smoothed, parts: list[Element]) -> Te
     return scores
 
 
-def _of_tails(here: Measured, at: Smoothed) -> Tensor:
+def _of_tails(program: Program, at: Smoothed) -> Tensor:
     """What a change of one over the degrees of freedom ν of a Student t is worth, `(T + 1, B, K)`: the slope of its
     log-density at the root of the mean square, where a normal touches it; zero where the noise is normal."""
-    found, own = at.measurements, at.measurements.present & (here.tails > 0)
-    freedom = 1 / here.tails[own].double()
-    size = (here.spread.expand(own.shape)[own] * at.sharpness[own]).clamp(min=1e-12)
+    found, seen = at.measurements, at.measurements.present.any(-1)
+    here, there = measured(program, at.states[seen].unsqueeze(1)), found.present[seen]
+    tails, spread = (values.squeeze(-2).expand(there.shape) for values in (here.tails, here.spread))
+    own = torch.zeros_like(found.present).masked_scatter(
+        seen.unsqueeze(-1).expand_as(found.present), there & (tails > 0)
+    )
+    freedom = 1 / tails[own[seen]].double()
+    size = (spread[own[seen]] * at.sharpness[own]).clamp(min=1e-12)
     squares = ((found.mean[own].square() + found.variance[own].clamp(min=0)) / size.square()).double()
     constant = torch.special.digamma((freedom + 1) / 2) - torch.special.digamma(freedom / 2) - 1 / freedom
     varying = (freedom + 1) * squares / (freedom + squares) / freedom - torch.log1p(squares / freedom)

@@ -25,15 +25,20 @@ def lagged(control: Tensor, time: Tensor, constant: Tensor) -> Tensor:
     stays = (-steps / torch.maximum(constant, 1e-5 * steps)).exp()
     share = constant / steps * (1 - stays)
     given = (control, *torch.broadcast_tensors(share, stays))
-    is_learned = torch.is_grad_enabled() and any(part.requires_grad for part in given)
-    kinds = {(part.dtype, part.device.type) for part in given}
-    if not is_learned and kinds in ({(torch.float32, "cpu")}, {(torch.float64, "cpu")}):
+    if _is_plain(*given):
         return torch.from_numpy(_followed(*(part.detach().contiguous().numpy() for part in given)))
     at, means = control[0], []
     for row in range(len(control)):
         means.append(control[row] + (at - control[row]) * share[row])
         at = control[row] + (at - control[row]) * stays[row]
     return torch.stack(means)
+
+
+def _is_plain(*given: Tensor) -> bool:
+    """Whether all are numbers of one precision in the host's memory, and none is learned by gradients."""
+    is_learned = torch.is_grad_enabled() and any(part.requires_grad for part in given)
+    kinds = {(part.dtype, part.device.type) for part in given}
+    return not is_learned and kinds in ({(torch.float32, "cpu")}, {(torch.float64, "cpu")})
 
 
 @njit(cache=True, error_model="numpy")
@@ -65,7 +70,9 @@ def delayed(control: Tensor, time: Tensor, delay: Tensor) -> Tensor:
     edges = torch.cat([time, time[-1:] + row_spans(time)[-1:]])
     held = (edges[1:] - edges[:-1]).unsqueeze(-1) * control
     total = torch.cat([torch.zeros_like(held[:1]), held.cumsum(0)])  # the control's integral from the first row
-
+    if delay.numel() == 1 and _is_plain(control, edges, delay):
+        given = (control, edges, total, delay.reshape(1))
+        return torch.from_numpy(_held_ago(*(part.detach().contiguous().numpy() for part in given)))
     ago = (edges - delay).contiguous()
     row = torch.searchsorted(edges.t().contiguous(), ago.t().contiguous()).t() - 1  # the one before, on an edge
     row = row.clamp(0, len(control) - 1)
@@ -73,6 +80,26 @@ def delayed(control: Tensor, time: Tensor, delay: Tensor) -> Tensor:
     since = (ago - edges.gather(0, row)).unsqueeze(-1)  # negative before the first row, whose control was held
     integral = total.gather(0, wide) + since * control.gather(0, wide)
     return (integral[1:] - integral[:-1]) / (edges[1:] - edges[:-1]).unsqueeze(-1)
+
+
+@njit(cache=True, error_model="numpy")
+def _held_ago(control: Array, edges: Array, total: Array, delay: Array) -> Array:
+    """What `delayed` computes from the control's integral `total` at the `edges` of rows, compiled."""
+    rows, drives, count = control.shape
+    means, integral = np.empty_like(control), np.empty_like(total)
+    for b in range(drives):
+        row = 0
+        for edge in range(rows + 1):
+            ago = edges[edge, b] - delay[0]
+            while row + 1 < rows and edges[row + 1, b] < ago:
+                row += 1
+            since = ago - edges[row, b]
+            for u in range(count):
+                integral[edge, b, u] = total[row, b, u] + since * control[row, b, u]
+        for row in range(rows):
+            for u in range(count):
+                means[row, b, u] = (integral[row + 1, b, u] - integral[row, b, u]) / (edges[row + 1, b] - edges[row, b])
+    return means
 
 
 def row_spans(time: Tensor) -> Tensor:

@@ -78,12 +78,14 @@ def test_nothing_happens_at_zero_and_to_a_single_row(acts) -> None:
 
 
 @pytest.mark.parametrize("kind", [torch.float32, torch.float64])
-def test_the_compiled_loop_of_a_lag_is_torchs(kind: torch.dtype) -> None:
+@pytest.mark.parametrize("acts", [lagged, delayed])
+def test_the_compiled_loop_is_torchs(kind: torch.dtype, acts) -> None:
     control, time = (part.to(kind) for part in held())
-    learned = torch.tensor(0.17, dtype=kind, requires_grad=True)
-    by_torch = lagged(control, time, learned)
-    assert by_torch.requires_grad
-    assert torch.equal(lagged(control, time, learned.detach()), by_torch)
+    for seconds in (0.0, 0.1, 0.17, 0.93, 40.0):
+        learned = torch.tensor(seconds, dtype=kind, requires_grad=True)
+        by_torch = acts(control, time, learned)
+        assert by_torch.requires_grad
+        assert torch.equal(acts(control, time, learned.detach()), by_torch)
 
 
 @pytest.mark.parametrize("acts", [lagged, delayed])
