@@ -23,6 +23,7 @@ from steady_ppl import (
 )
 from steady_ppl.errors import require
 from steady_ppl.kernels.rows import fallback_notes, kernel_failures
+from steady_ppl.likelihood.information import information_of_fit
 from steady_ppl.likelihood.maximize import MIN_GAIN_OF_START
 from steady_ppl.likelihood.parameter_posterior import undetermined
 from steady_ppl.likelihood.parameters import elements, set_values, values_of
@@ -112,10 +113,12 @@ def fit(
             f"not converged after {maximum.steps} steps, another would gain {maximum.decrement:.2g} nats: take more "
             f"(--steps {4 * steps})"
         )
-    notes += undetermined(Problem(program, data, known_start), maximum.path)
-    notes += validation.notes + doubtful
+    problem = Problem(program, data, known_start)
+    notes += undetermined(problem, maximum.path)
+    information, unknown = information_of_fit(problem, maximum.path, maximum.information)
+    notes += validation.notes + doubtful + unknown
     trained = Trained(history, kept=maximum.steps)
-    return Fit(program, "likelihood", settings, seed=seed, known_start=known_start, trained=trained, notes=notes)
+    return Fit(program, "likelihood", settings, seed, known_start, trained, notes, information)
 
 
 def elsewhere(declared, fitted, information, key):

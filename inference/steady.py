@@ -24,6 +24,8 @@ from steady_ppl import (
     train,
     why_not_linear,
 )
+from steady_ppl.likelihood.information import information_of_fit
+from steady_ppl.model.problem import Problem
 from steady_ppl.smc.genealogy import degeneracy_note
 
 # What the paper and its authors' code use, best with AuthorsHovercraft or AuthorsTruck; hours on two cores:
@@ -142,7 +144,10 @@ def fit(
         )
     if guide == "gaussian" and not trained.interrupted:
         notes += doubts(program, data, known_start, seed, "guide=lookahead")
-    return Fit(program, "steady", settings, seed=seed, known_start=known_start, trained=trained, notes=notes)
+    with seeded(seed, "information"):
+        information, unknown = information_of_fit(Problem(program, data, known_start).without_truth())
+    notes += unknown
+    return Fit(program, "steady", settings, seed, known_start, trained, notes, information)
 
 
 def doubts(program, data: Trajectories, known_start: bool, seed: int, instead: str) -> list[str]:

@@ -20,6 +20,19 @@ settings.load_profile("repeated")
 TOLD_AT_ONCE = 20.0  # seconds of a test or of what it needs
 
 
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption("--share", metavar="K/N", help="of the tests that are selected only every Nth, from number K on")
+
+
+@pytest.hookimpl(trylast=True)  # after -m
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    if share := config.getoption("--share"):
+        first, shares = (int(number) for number in share.split("/"))
+        others = [item for index, item in enumerate(items) if index % shares != first % shares]
+        items[:] = items[first % shares :: shares]
+        config.hook.pytest_deselected(items=others)
+
+
 def pytest_configure(config: pytest.Config) -> None:
     if not hasattr(config, "workerinput"):
         config.pluginmanager.register(LongTests(config))

@@ -43,6 +43,10 @@ Substeps = Annotated[
 Seed = Annotated[int, typer.Option(help="Random seed.", min=0, max=2**63 - 1)]  # a run's record holds 63 bits
 Overwrite = Annotated[bool, typer.Option("--force", help="Overwrite an existing run.")]
 Table = Annotated[Path, typer.Option("--out", help="Table to write, .csv or .parquet.")]
+Horizons = Annotated[
+    list[float] | None,
+    typer.Option("--horizon", metavar="SECONDS", help="Time ahead, once for each; as suits the drives when not given."),
+]
 Json = Annotated[
     Path | None, typer.Option("--json", help="Write the figures to this file; - prints them instead of the text.")
 ]

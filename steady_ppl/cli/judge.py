@@ -42,6 +42,7 @@ def check(
         ),
     ] = None,
     simulations: Annotated[int, common.count("Simulated sets for the bands.", least=20)] = 100,
+    horizon: common.Horizons = None,
     program: common.Moved = None,
     seed: common.Seed = 0,
 ) -> None:
@@ -58,7 +59,7 @@ def check(
             raise UsageError(f"--mask {mask} is the table itself, or the file of --json: name another file")
     fit = st.Fit.load(run, program)
     drives = read_drives(table, fit.program, SAID_BY_CHECK)
-    found = st.check(fit, drives, simulations=simulations, seed=seed)
+    found = st.check(fit, drives, simulations=simulations, horizons=horizon or (), seed=seed)
     if picture is not None:
         from steady_ppl.plotting.check import check_picture
 
@@ -77,6 +78,7 @@ def prove(
     oracle: Annotated[Path | None, typer.Option(help="A run of the true structure, fitted like the others.")] = None,
     json_file: common.Json = None,
     picture: Annotated[Path | None, typer.Option(help="Draw the errors into this file, for example .png.")] = None,
+    horizon: common.Horizons = None,
     program: Annotated[list[str] | None, common.moved("once for each RUN and the oracle, in order")] = None,
     seed: common.Seed = 0,
 ) -> None:
@@ -94,7 +96,8 @@ def prove(
     if truth is not None:
         rows["truth"] = program_from(truth, seed)
     drives = st.read_table(table)
-    found = st.prove(rows, drives, truth="truth" if truth is not None else None, seed=seed)
+    true = "truth" if truth is not None else None
+    found = st.prove(rows, drives, truth=true, horizons=horizon or (), seed=seed)
     found.notes[:0] = used_before(labels, fingerprint(drives))
     if picture is not None:
         from steady_ppl.plotting.comparison import proof_picture
@@ -192,6 +195,7 @@ def report(
     ] = None,
     title: Annotated[str | None, typer.Option(help="Of the page; the runs' names when not given.")] = None,
     simulations: Annotated[int, common.count("Simulated sets for the bands.", least=20)] = SIMULATIONS,
+    horizon: common.Horizons = None,
     program: Annotated[list[str] | None, common.moved("once for each RUN, in order")] = None,
     seed: common.Seed = 0,
 ) -> None:
@@ -214,6 +218,7 @@ def report(
         raise UsageError(f"{discovery} is neither a RUN that `steady discover` made nor its --json file")
     given: list[tuple[str, Any]] = [("--discovery", discovery), ("--title", title)]
     given += [("--program", one) for one in program or []]
+    given += [("--horizon", f"{seconds:g}") for seconds in horizon or []]
     given += [("--simulations", simulations if simulations != SIMULATIONS else None), ("--seed", seed or None)]
     words = ["steady", "report", *map(str, arguments)]
     words += [word for name, value in [*given, ("--out", out)] if value is not None for word in (name, str(value))]
@@ -227,6 +232,7 @@ def report(
         how=["\n".join(how)],
         notes=used_before(labels, digest),
         simulations=simulations,
+        horizons=horizon or (),
         seed=seed,
     ).write(out)
     tell(f"{out}: {', '.join(labels)} on {len(drives)} drives")

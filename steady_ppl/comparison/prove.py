@@ -5,29 +5,31 @@ particle filter says how far its log p(y) is from the program's own.
 """
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from steady_ppl.comparison.result import CONSTANT_VELOCITY, NOISE_FLOOR, Proof
+from steady_ppl.comparison.result import CONSTANT_VELOCITY, LAST_MEASUREMENT, NOISE_FLOOR, Proof
 from steady_ppl.comparison.scores import (
     MIN_DRIVES,
-    PROOF_HORIZONS_SECONDS,
+    PROOF_HORIZONS,
     Judged,
     ProgramScores,
     as_row,
     judge_constant_velocity,
     judge_program,
     noise_floor,
+    row_of_last_measurement,
 )
+from steady_ppl.data.horizons import named_horizons
 from steady_ppl.data.table import refuse_long
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.errors import DataError, UsageError
 from steady_ppl.gaussian.linearize import ReferencePath
-from steady_ppl.gaussian.predict import named_horizons
-from steady_ppl.model.program import Program
+from steady_ppl.model.problem import Problem
+from steady_ppl.model.program import Program, for_program
 from steady_ppl.runs.diagnostics import diagnose_units
 from steady_ppl.runs.fit import Fit
 from steady_ppl.utils.cores import one_thread
@@ -47,12 +49,13 @@ def prove(
     truth: str | None = None,
     with_constant_velocity: bool = True,
     paths: Mapping[str, ReferencePath] | None = None,
+    horizons: Sequence[float] = (),
     seed: int = 0,
 ) -> Proof:
     """Compare programs on drives: log p(y), open-loop errors, coverage, noise scales.
 
     log p(y) is that of the linearised program, per trajectory; what a particle filter adds to it is near zero where it
-    can be trusted. Errors are root mean squares of measured less predicted, 1, 3 and 10 s ahead of every row's filtered
+    can be trusted. Errors are root mean squares of measured less predicted, some times ahead of every row's filtered
     state, without noise and with the recorded controls, over the components that share a unit; and of the program's
     error groups where the x. columns are known. Only measurements that every row predicts count.
 
@@ -65,6 +68,7 @@ def prove(
         truth: the row whose program made the drives; its own simulated drives give the noise floor.
         with_constant_velocity: add a row of the reference without any acceleration but noise.
         paths: name → path near the posterior means of the drives, where one is known; others are searched for.
+        horizons: seconds ahead; those that suit the drives where none is given, see `data.horizons`.
         seed: of the search for paths, the simulation and the resampling.
 
     Raises:
@@ -86,13 +90,15 @@ def prove(
             notes.append("some rows were fitted with a known start and some without: all are judged without")
     reference = next(iter(programs), "") if reference is None else reference
     _require(programs, reference, truth, data)
-    judged: dict[str, Judged] = {}
+    judged, ahead = dict[str, Judged](), dict[str, int]()
     with stages(*((f"judging {name}", 1) for name in programs), ("judging the constant velocity", 0.5)) as begin:
         for name, program in programs.items():
             begin()
             same = next((other for other in judged if programs[other] is program), None)
             path = (paths or {}).get(name)
-            judged[name] = judged[same] if same else judge_program(name, program, data, known_start, seed, path)
+            problem = Problem(program, for_program(program, data), known_start)
+            ahead = ahead or named_horizons(problem.data, PROOF_HORIZONS, horizons)
+            judged[name] = judged[same] if same else judge_program(name, problem, ahead, seed, path)
         begin()
         before, true = judged[reference], judged.get(truth or "")
         coasting = judge_constant_velocity(before) if with_constant_velocity else None
@@ -103,13 +109,13 @@ def prove(
     notes += [f"no row {name!r}: {why}" for name, why in absent.items() if isinstance(why, str)]
     counted = _counted(judged.values())
     found = {name: as_row(row, counted) for name, row in judged.items()}
+    found[LAST_MEASUREMENT] = row_of_last_measurement(before, counted)
     if isinstance(floor, Judged):
         found[NOISE_FLOOR] = as_row(floor, _counted([floor]))
     drives = before.problem.data
-    horizons = named_horizons(drives, PROOF_HORIZONS_SECONDS)
     notes += drives.uneven_steps + diagnose_units(before.problem.program, drives)
-    notes += _few_rows(drives, horizons, known_start) + unconverged(rows) + _blown_up(found) + doubtful(found, data)
-    return Proof(found, reference, horizons, drives.median_step, len(data), known_start, seed, notes)
+    notes += _few_rows(drives, ahead, known_start) + unconverged(rows) + _blown_up(found) + doubtful(found, data)
+    return Proof(found, reference, ahead, drives.median_step, len(data), known_start, seed, notes)
 
 
 def _counted(judged: Iterable[Judged]) -> dict[int, Tensor]:
@@ -133,7 +139,7 @@ def _require(programs: Mapping[str, Program], reference: str, truth: str | None,
     for name in (reference, truth):
         if name is not None and name not in programs:
             raise UsageError(f"there is no row {name!r}; the rows are {', '.join(programs)}")
-    for taken in {NOISE_FLOOR, CONSTANT_VELOCITY} & programs.keys():
+    for taken in {NOISE_FLOOR, CONSTANT_VELOCITY, LAST_MEASUREMENT} & programs.keys():
         raise UsageError(f"a row cannot be called {taken!r}: that is the name of a row of its own")
     ours = programs[reference].measurement_names
     for name, program in programs.items():

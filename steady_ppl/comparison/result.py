@@ -15,8 +15,15 @@ from steady_ppl.utils.context import Displayed
 from steady_ppl.utils.text import TEXT_WIDTH, aligned, figure, with_unit
 
 NAME_COLUMNS = 20  # characters of a row's name
-NOISE_FLOOR, CONSTANT_VELOCITY = "noise floor", "constant velocity"  # rows that `prove` adds
-BASELINE_ROWS = (NOISE_FLOOR, CONSTANT_VELOCITY, "oracle", "truth")  # that show what is possible
+NOISE_FLOOR, CONSTANT_VELOCITY, LAST_MEASUREMENT = "noise floor", "constant velocity", "last measurement"
+"""Rows that `prove` adds; a model has to beat the last two."""
+BASELINE_ROWS = (NOISE_FLOOR, CONSTANT_VELOCITY, LAST_MEASUREMENT, "oracle", "truth")  # that show what is possible
+MAX_DOUBT = 2.0  # nats a drive by which particles may see a difference of log p(y) otherwise
+BY_PARTICLES = Key("log_likelihood_by_particles", "", 0)
+SIMPLE_ROWS = {  # what knows nothing of the vehicle, in words
+    CONSTANT_VELOCITY: "a vehicle that keeps its velocity",
+    LAST_MEASUREMENT: "the last measurement",
+}
 PHRASES_OF_SIGNS = {  # the signs of what log p(y) and the error gained
     (0, 0): ("is not shown to help", "is not shown to be better than"),
     (1, 1): ("helps", "is better than"),
@@ -87,7 +94,7 @@ class Proof(Displayed):
         drives = f"{self.trajectories} drives; differences are from {self.reference}"
         said = f"{drives}, with {COVERAGE:.0%} intervals bootstrapped over drives"
         lines = [*textwrap.wrap(content["verdict"], TEXT_WIDTH), "", said, ""]
-        bands = [name for name in BANDED_HORIZONS if name in horizons]
+        bands = horizons[:BANDED_HORIZONS]
         shown = [name if i else f"in 90 % band, {name}" for i, name in enumerate(bands)]
         header = ["", "log p(y) [nats]", "difference [nats]", "by particles", *shown]
         lines += _table([header, *([row["row"], *_likelihood_cells(row, bands)] for row in rows)])
@@ -124,9 +131,10 @@ def _against_reference(found: Proof, name: str) -> dict[str, Any] | None:
 def _by_key(found: Proof, values: Mapping[Key, Any]) -> dict[str, Any]:
     """Figures nested by kind, of what, and the horizon's name."""
     ahead = {rows: name for name, rows in found.horizons.items()}
-    nested: dict[str, Any] = {"log_likelihood": None, "measurement": {}, "state": {}, "coverage_90": {}}
+    nested: dict[str, Any] = {"log_likelihood": None, "log_likelihood_by_particles": None}
+    nested |= {"measurement": {}, "state": {}, "coverage_90": {}}
     for key, value in values.items():
-        if key.kind == "log_likelihood":
+        if not key.horizon:
             nested[key.kind] = value
         elif key.horizon in ahead:
             place = nested[key.kind].setdefault(key.of, {}) if key.of or key.kind == "measurement" else nested[key.kind]
@@ -136,7 +144,11 @@ def _by_key(found: Proof, values: Mapping[Key, Any]) -> dict[str, Any]:
 
 def changes(found: Proof, name: str) -> dict[Key, Change | None]:
     """A row's figures less the reference's, at the horizons that have names."""
-    theirs, wanted = found.rows[found.reference].sums, {0, *found.horizons.values()}
+    return _differences(found, name, found.reference)
+
+
+def _differences(found: Proof, name: str, other: str) -> dict[Key, Change | None]:
+    theirs, wanted = found.rows[other].sums, {0, *found.horizons.values()}
     ours = {key: sums for key, sums in found.rows[name].sums.items() if key in theirs and key.horizon in wanted}
     return {key: paired(sums, theirs[key], seed=found.seed) for key, sums in ours.items()}
 
@@ -146,10 +158,11 @@ def verdict(found: Proof) -> str:
     others = [name for name in found.rows if name != found.reference]
     name = next((name for name in reversed(others) if name not in BASELINE_ROWS), others[0])
     changed = changes(found, name)
-    likely = changed[Key("log_likelihood", "", 0)]
-    horizon = next(h for h in ("3 s", "1 s", "10 s", "one step") if h in found.horizons)
-    errors = {key.of: change for key, change in changed.items() if key[::2] == ("measurement", found.horizons[horizon])}
-    parts = [f"log p(y) {with_interval(likely.difference, likely.interval, 1, ' nats a drive')}"] if likely else []
+    likely, how = _ruling(found, name, changed)
+    horizon = _far(found)
+    errors = _errors_at(found, horizon, changed)
+    parts = [f"log p(y) {how}{with_interval(likely.difference, likely.interval, 1, ' nats a drive')}"] if likely else []
+    parts += [how] if how and not likely else []
     for of, change in errors.items():
         where = f" in {of}" if len(errors) > 1 and of else ""
         if differs := _differs(vars(change) if change else None):
@@ -158,7 +171,51 @@ def verdict(found: Proof) -> str:
     alone, between = PHRASES_OF_SIGNS[gained if gained in PHRASES_OF_SIGNS else (sum(gained), sum(gained))]
     added = _added(found.rows[found.reference], found.rows[name])
     said = f"Adding {added} {alone}" if added else f"{name} {between} {found.reference}"
-    return f"{said}: {', '.join(parts)}."
+    return f"{_no_models(found, name)}{said}: {', '.join(parts)}."
+
+
+def _far(found: Proof) -> str:
+    """The horizon of which the sentence speaks."""
+    return list(found.horizons)[:BANDED_HORIZONS][-1]
+
+
+def _errors_at(found: Proof, horizon: str, changed: Mapping[Key, Change | None]) -> dict[str, Change | None]:
+    """How the errors of measurements differ, by their unit."""
+    return {key.of: change for key, change in changed.items() if key[::2] == ("measurement", found.horizons[horizon])}
+
+
+def _ruling(found: Proof, name: str, changed: Mapping[Key, Change | None]) -> tuple[Change | None, str]:
+    """The difference of log p(y) that counts, and by what: particles', where they see it otherwise or follow only one
+    of the two programs."""
+    linear, by_particles = changed[Key("log_likelihood", "", 0)], changed.get(BY_PARTICLES)
+    lost = [one for one in (found.reference, name) if isinstance(found.rows[one].neglected, str)]
+    if lost:
+        return None, f"no particle filter follows {' or '.join(lost)}, so that log p(y) says nothing"
+    asked = all(isinstance(found.rows[one].neglected, Tensor) for one in (found.reference, name))
+    if asked and by_particles is None:
+        return None, "by particles log p(y) is not finite"
+    if linear is None or by_particles is None or abs(by_particles.difference - linear.difference) <= MAX_DOUBT:
+        return linear, ""
+    said = with_interval(linear.difference, linear.interval, 1, "")
+    return by_particles, f"(by particles; linearised {said}, which is not to be believed) "
+
+
+def _no_models(found: Proof, name: str) -> str:
+    """That programs predict worse than what knows nothing of the vehicle."""
+    horizon, lost = _far(found), dict[str, str]()
+    for one in (found.reference, name):
+        for simple, words in SIMPLE_ROWS.items():
+            if (
+                simple in found.rows
+                and _sign([*_errors_at(found, horizon, _differences(found, one, simple)).values()]) > 0
+            ):
+                lost[one] = words
+                break
+    if name not in lost:
+        return ""
+    if len(lost) == 1:
+        return f"{name} is not yet a model: {horizon} ahead it errs more than {lost[name]}. "
+    return f"Neither {found.reference} nor {name} is yet a model: {horizon} ahead both err more than {lost[name]}. "
 
 
 def _sign(found: Sequence[Change | None]) -> int:

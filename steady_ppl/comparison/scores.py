@@ -12,23 +12,21 @@ from scipy import special
 from torch import Tensor
 
 from steady_ppl.comparison.evaluate import has_truth, squared_errors
-from steady_ppl.criticism.baselines import constant_velocity
-from steady_ppl.data.trajectories import Trajectories
+from steady_ppl.criticism.baselines import constant_velocity, last_measurement
 from steady_ppl.errors import FilterError
 from steady_ppl.gaussian.information_filter import Lookahead
 from steady_ppl.gaussian.kalman import Tracked, track
 from steady_ppl.gaussian.linearize import ReferencePath, require_linear
-from steady_ppl.gaussian.predict import Prediction, named_horizons, predict, simulate_again, states_ahead
+from steady_ppl.gaussian.predict import Prediction, predict, simulate_again, states_ahead
 from steady_ppl.gaussian.smoother import find_and_smooth, smooth
 from steady_ppl.kernels.jit import unchanged
 from steady_ppl.likelihood.evidence import neglected
 from steady_ppl.likelihood.scores import measured, substep_spreads
 from steady_ppl.model.problem import Problem
-from steady_ppl.model.program import Program, error_indices, for_program
+from steady_ppl.model.program import Program, error_indices
 from steady_ppl.utils.random import seeded
 
-PROOF_HORIZONS_SECONDS = (1.0, 3.0, 10.0)  # ahead, besides one step
-BANDED_HORIZONS = ("one step", "1 s", "3 s")  # whose predictions have 90 % bands
+PROOF_HORIZONS, BANDED_HORIZONS = 3, 3  # times ahead besides one step; named horizons, one step among them, with bands
 CURVE_HORIZONS = 12  # horizons of the picture
 MAX_FLOOR_SETS, MAX_FLOOR_ROWS = 20, 100_000  # simulated sets for the noise floor, and rows of all their drives
 MIN_SHARE_OF_ROWS = 0.9  # of all rows; a bearing's noise grows beside its landmark
@@ -40,7 +38,7 @@ Scales = dict[str, dict[str, float | None]]  # "channels" and "measurements" →
 class Key(NamedTuple):
     """Which figure."""
 
-    kind: str  # log_likelihood, coverage_90, measurement or state
+    kind: str  # log_likelihood, log_likelihood_by_particles, coverage_90, measurement or state
     of: str  # the unit of measurements, the error group of states
     horizon: int  # rows, 0 for log p(y)
 
@@ -125,6 +123,7 @@ class Judged:
     """What a row is summed from: a lookahead and a filter along the same path."""
 
     problem: Problem  # the drives as the program reads them, with the truth
+    horizons: dict[str, int]  # name → rows ahead, one step first
     ahead: Lookahead
     tracked: Tracked
     predictions: dict[int, Prediction]  # horizon → measured less predicted
@@ -135,10 +134,10 @@ class Judged:
 
 
 def judge_program(
-    name: str, program: Program, data: Trajectories, known_start: bool, seed: int, path: ReferencePath | None = None
+    name: str, problem: Problem, horizons: dict[str, int], seed: int, path: ReferencePath | None = None
 ) -> Judged:
     """Find the paths from the measurements alone, unless one is given; predict, and compare; errors as of `prove`."""
-    problem = Problem(program, for_program(program, data), known_start)
+    program, known_start = problem.program, problem.known_start
     unseen = problem.without_truth()
     require_linear(unseen, f"{name}: prove needs programs that can be linearised", " (`steady evaluate` takes any)")
     with unchanged(program):
@@ -147,7 +146,7 @@ def judge_program(
                 ahead = find_and_smooth(unseen, path=path)
         except FilterError as error:
             raise FilterError(f"{name}: {error}", trajectory=error.trajectory, time=error.time) from error
-        judged = compare_predictions(problem, ahead)
+        judged = compare_predictions(problem, ahead, horizons)
         try:
             with seeded(seed, "prove by particles"):
                 return replace(judged, neglected=neglected(program, unseen.data, known_start=known_start, ahead=ahead))
@@ -155,14 +154,13 @@ def judge_program(
             return replace(judged, neglected=str(error))
 
 
-def compare_predictions(problem: Problem, ahead: Lookahead) -> Judged:
+def compare_predictions(problem: Problem, ahead: Lookahead, named: dict[str, int]) -> Judged:
     """Track along a path that was found and compare what is predicted from every row with measurements and truth."""
     program, data, unseen = problem.program, problem.data, problem.without_truth()
     tracked = track(unseen, ahead.linearization.path)
-    named = named_horizons(data, PROOF_HORIZONS_SECONDS)
     longest, states = max(named.values()), dict[tuple[str, int], tuple[Tensor, Tensor]]()
     horizons = {round(rows) for rows in np.geomspace(1, longest, CURVE_HORIZONS).tolist()} | set(named.values())
-    bands = [named[name] for name in BANDED_HORIZONS if name in named]
+    bands = list(named.values())[:BANDED_HORIZONS]
     predictions = predict(program, unseen.data, tracked, sorted(horizons), bands=bands)
     if data.states is not None and has_truth(data):
         for horizon, state in states_ahead(program, unseen.data, tracked, longest):
@@ -171,7 +169,7 @@ def compare_predictions(problem: Problem, ahead: Lookahead) -> Judged:
                 for group, squares in squared_errors(program, state, truth).items():
                     known = torch.isfinite(truth[..., list(error_indices(program)[group])]).all(-1)
                     states[group, horizon] = squares, known
-    return Judged(problem, ahead, tracked, predictions, states)
+    return Judged(problem, named, ahead, tracked, predictions, states)
 
 
 def judge_constant_velocity(before: Judged) -> Judged | str:
@@ -184,7 +182,7 @@ def judge_constant_velocity(before: Judged) -> Judged | str:
     ahead = smooth(replace(unseen, program=found.program), replace(path, noise=torch.zeros_like(path.noise)))
     if bool(ahead.is_broken.any()):
         return "it blows up on these drives"
-    return compare_predictions(replace(before.problem, program=found.program), ahead)
+    return compare_predictions(replace(before.problem, program=found.program), ahead, before.horizons)
 
 
 def noise_floor(true: Judged, seed: int) -> Judged | str:
@@ -202,26 +200,43 @@ def noise_floor(true: Judged, seed: int) -> Judged | str:
         return "the true program does not explain drives of its own"
     if true.states:
         own = replace(own, data=replace(again, states=torch.where(again.rows.unsqueeze(-1), path.states, torch.nan)))
-    return compare_predictions(own, ahead)
+    return compare_predictions(own, ahead, true.horizons)
 
 
 def as_row(judged: Judged, counted: Mapping[int, Tensor]) -> ProgramScores:
     """Sum over each drive the cells that count, `(T + 1 − horizon, B, K)` for each horizon."""
     likely = judged.ahead.log_likelihood.numpy(force=True)
     sums = {Key("log_likelihood", "", 0): Sums(likely, np.ones_like(likely))}
-    problem, unit = judged.problem, judged.problem.program.measurement_units
+    if isinstance(judged.neglected, Tensor):
+        by_particles = likely + judged.neglected.numpy(force=True)
+        sums[Key("log_likelihood_by_particles", "", 0)] = Sums(by_particles, np.ones_like(likely))
+    problem = judged.problem
     for horizon, ahead in judged.predictions.items():
         seen = counted[horizon]
-        for of in dict.fromkeys(unit):
-            chosen = [i for i, name in enumerate(unit) if name == of]
-            squares = ahead.error[..., chosen].square()
-            sums[Key("measurement", of, horizon)] = _sums(squares, seen[..., chosen], root=True)
+        sums |= _of_measurements(problem.program, horizon, ahead.error, seen)
         if bool(torch.isfinite(ahead.variance[seen]).any()):
             sums[Key("coverage_90", "", horizon)] = _sums(ahead.covered(), seen)
     for (group, horizon), (squares, known) in judged.states.items():
         if bool(known.any()):
             sums[Key("state", group, horizon)] = _sums(squares.unsqueeze(-1), known.unsqueeze(-1), root=True)
     return ProgramScores(problem.program, sums, noise_scales(problem, judged.tracked), judged.neglected)
+
+
+def row_of_last_measurement(judged: Judged, counted: Mapping[int, Tensor]) -> ProgramScores:
+    """The errors of a measurement that stays as it was, of the cells that count and have been measured before."""
+    problem, sums = judged.problem.without_truth(), dict[Key, Sums]()
+    held = last_measurement(problem, judged.tracked.smoothed, list(judged.predictions))
+    for horizon, (error, both) in held.items():
+        sums |= _of_measurements(problem.program, horizon, error, counted[horizon] & both)
+    return ProgramScores(problem.program, sums, {"channels": {}, "measurements": {}})
+
+
+def _of_measurements(program: Program, horizon: int, error: Tensor, seen: Tensor) -> dict[Key, Sums]:
+    units, found = program.measurement_units, dict[Key, Sums]()
+    for of in dict.fromkeys(units):
+        chosen = [i for i, name in enumerate(units) if name == of]
+        found[Key("measurement", of, horizon)] = _sums(error[..., chosen].square(), seen[..., chosen], root=True)
+    return found
 
 
 def _sums(values: Tensor, there: Tensor, *, root: bool = False) -> Sums:

@@ -20,12 +20,13 @@ from steady_ppl.criticism.residual_maps import Residuals, misfit_of
 from steady_ppl.criticism.result import Check
 from steady_ppl.criticism.step_size import check_step
 from steady_ppl.data.frozen_sensors import frozen_stretches
+from steady_ppl.data.horizons import named_horizons
 from steady_ppl.data.table import refuse_long
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.errors import DataError, UsageError
 from steady_ppl.gaussian.kalman import track
 from steady_ppl.gaussian.linearize import require_linear
-from steady_ppl.gaussian.predict import named_horizons, predict
+from steady_ppl.gaussian.predict import predict
 from steady_ppl.gaussian.smoother import find_and_smooth
 from steady_ppl.kernels.rows import fallback_notes, kernel_failures
 from steady_ppl.likelihood.outliers import find_outliers
@@ -38,13 +39,15 @@ from steady_ppl.utils.cores import one_thread
 from steady_ppl.utils.progress import stages
 from steady_ppl.utils.random import seeded
 
-CHECK_HORIZONS_SECONDS = (1.0, 3.0)  # ahead, besides one step
+CHECK_HORIZONS = 2  # times ahead, besides one step
 MAX_RESIDUAL_SD = 4.0  # of a single residual; beside a landmark the linearised program knows no more
 
 
 @one_thread()
 @torch.no_grad()
-def check(fit: Fit, data: Trajectories, *, simulations: int = 100, seed: int = 0) -> Check:
+def check(
+    fit: Fit, data: Trajectories, *, simulations: int = 100, horizons: Sequence[float] = (), seed: int = 0
+) -> Check:
     """Compare a fitted program with measurements.
 
     Args:
@@ -52,6 +55,7 @@ def check(fit: Fit, data: Trajectories, *, simulations: int = 100, seed: int = 0
             of the truth ever is, but to see whether the table itself has stretches that nobody measured.
         data: drives, best those that were not used for the fit.
         simulations: sets of drives to simulate for the bands.
+        horizons: seconds ahead, besides one step; those that suit the drives where none is given, see `data.horizons`.
         seed: of the simulation.
 
     Raises:
@@ -72,7 +76,9 @@ def check(fit: Fit, data: Trajectories, *, simulations: int = 100, seed: int = 0
         raise DataError("nothing to compare: no trajectory has a measurement after its first row")
     refuse_long(run)
     require_linear(problem, "check needs a program that can be linearised")
-    horizons = named_horizons(run, CHECK_HORIZONS_SECONDS)
+    ahead_by = named_horizons(run, CHECK_HORIZONS, horizons)
+    known = fit.information if fit.information is not None and fit.information.suits(program) else None
+    unseen = known is not None and not known.has_seen(run)
     parts = (("finding paths", 1), ("comparing time steps", 1), ("simulating drives", 2), ("judging", 2))
     with stages(*parts) as begin:
         begin()
@@ -90,8 +96,9 @@ def check(fit: Fit, data: Trajectories, *, simulations: int = 100, seed: int = 0
             begin()
             step = check_step(program, run, path, known_start=fit.known_start)
             begin()
-            rows = list(horizons.values())
-            made = simulate_sets(problem, starts, real.noise.shape[-1], rows)
+            rows = list(ahead_by.values())
+            values = known.draws(program, simulations) if known is not None and unseen else None
+            made = simulate_sets(problem, starts, real.noise.shape[-1], rows, values)
         begin()
         predictions = predict(program, run, real, rows)
         ours = replace(residuals(program, run, real, predictions[1], 1), raw=predictions[1].error.numpy(force=True))
@@ -115,7 +122,7 @@ def check(fit: Fit, data: Trajectories, *, simulations: int = 100, seed: int = 0
         program=program,
         data=run,
         path=path,
-        horizons=horizons,
+        horizons=ahead_by,
         predictions=predictions,
         floor=made.floor,
         reference=constant_velocity(problem, real, rows),
@@ -127,6 +134,8 @@ def check(fit: Fit, data: Trajectories, *, simulations: int = 100, seed: int = 0
         standardised=ours,
         stuck=frozen_stretches(data),
         outliers=outliers,
+        fitted=known,
+        unseen=unseen,
         notes=notes,
     )
 

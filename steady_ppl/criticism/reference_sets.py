@@ -4,7 +4,9 @@ Sets are simulated, smoothed and judged a block at a time, so that memory does n
 drives': three hundred drives and a hundred sets at once would take fourteen gigabytes.
 """
 
-from collections.abc import Sequence
+import copy
+import itertools
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -18,8 +20,9 @@ from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.errors import FilterError
 from steady_ppl.gaussian.kalman import Tracked, track
 from steady_ppl.gaussian.linearize import ReferencePath
-from steady_ppl.gaussian.predict import Prediction, predict, simulate_again
+from steady_ppl.gaussian.predict import Prediction, predict, simulate_each
 from steady_ppl.gaussian.smoother import REST_TOLERANCE, smooth
+from steady_ppl.likelihood.parameters import elements, set_values
 from steady_ppl.model.problem import Problem
 from steady_ppl.model.program import Program
 from steady_ppl.utils.angles import wrap_angles
@@ -43,25 +46,30 @@ class SimulatedSets:
 
 
 @torch.no_grad()
-def simulate_sets(problem: Problem, starts: Tensor, channels: int, horizons: Sequence[int]) -> SimulatedSets:
-    """Simulate, track and predict.
+def simulate_sets(
+    problem: Problem, starts: Tensor, channels: int, horizons: Sequence[int], values: Tensor | None = None
+) -> SimulatedSets:
+    """Simulate, and track and predict with the program as it is.
 
     Args:
         problem: a program and `B` drives.
         starts: `(M, B, D)`, where each drive of each set begins.
         channels: C, how many numbers a step's noise has.
         horizons: rows ahead, one row among them.
+        values: `(M, P)`, the learnable numbers under which each set is simulated; None: as they are.
 
     Raises:
         FilterError: too many sets blew up.
     """
     at_once, seed = max(1, MAX_ROWS_OF_BLOCK // problem.data.time.numel()), int(torch.randint(2**31, ()))
 
-    def simulate(number: int, block: Tensor) -> Output:
+    def simulate(number: int, block: Tensor, under: Tensor | None) -> Output:
         with seeded(seed + number, "block"):
-            return _block(problem, block, channels, horizons)
+            return _block(problem, block, under, channels, horizons)
 
-    jobs = [partial(simulate, number, block) for number, block in enumerate(starts.split(at_once))]
+    blocks_of_starts = starts.split(at_once)
+    under = [None] * len(blocks_of_starts) if values is None else values.split(at_once)
+    jobs = [partial(simulate, *job) for job in zip(itertools.count(), blocks_of_starts, under)]
     blocks = [(tensors, said) for tensors, said in run_in_parallel(jobs) if tensors]
     sets = sum(len(tensors["values"]) for tensors, _ in blocks)
     if sets < MIN_BAND_SETS:
@@ -82,11 +90,12 @@ def simulate_sets(problem: Problem, starts: Tensor, channels: int, horizons: Seq
     )
 
 
-def _block(problem: Problem, starts: Tensor, channels: int, horizons: Sequence[int]) -> Output:
+def _block(problem: Problem, starts: Tensor, values: Tensor | None, channels: int, horizons: Sequence[int]) -> Output:
     """What `SimulatedSets` has of some sets, each tensor with the sets or their drives in front, and the names in it;
     nothing where every set blew up."""
     program, sets = problem.program, len(starts)
-    again, truth = simulate_again(program, problem.data, starts, channels)
+    programs, begins = ([program], [starts]) if values is None else (_moved(program, values), starts.split(1))
+    again, truth = simulate_each(programs, problem.data, begins, channels)
     copies = replace(problem, data=again)
     near, tracked = _tracked(copies, truth)
     whole = torch.isfinite(tracked.log_likelihood).view(sets, -1).all(1)
@@ -106,6 +115,15 @@ def _block(problem: Problem, starts: Tensor, channels: int, horizons: Sequence[i
     said = {"names": errors.names, "variables": list(errors.variables), "horizons": list(simulated)}
     said["directions"] = [[one.kind, one.name] for one in scores]
     return tensors | {f"scores {one.name}": one.scores for one in scores}, said
+
+
+def _moved(program: Program, values: Tensor) -> Iterator[Program]:
+    """A copy of a program with some numbers `(M, P)` after the others, each until the next is asked for."""
+    program = copy.deepcopy(program)
+    parts = elements(program)
+    for each in values:
+        set_values(parts, each)
+        yield program
 
 
 def _tracked(problem: Problem, truth: ReferencePath) -> tuple[ReferencePath, Tracked]:

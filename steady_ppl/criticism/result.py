@@ -16,12 +16,14 @@ from steady_ppl.data.frozen_sensors import Stretch
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.gaussian.linearize import ReferencePath
 from steady_ppl.gaussian.predict import HALF_WIDTH, Prediction
+from steady_ppl.likelihood.information import ParameterInformation
 from steady_ppl.likelihood.outliers import Outliers
 from steady_ppl.model.program import Program, unit_of
 from steady_ppl.utils.context import Displayed
 from steady_ppl.utils.text import aligned, figure, with_unit
 
 MAX_FINDINGS_SHOWN = 8  # findings in the table
+MIN_GAIN_OF_FIT = 1.0  # nats that a longer fit must gain to be what is advised first
 VERDICTS = {  # the verdict; and what stands out as well, which is no verdict while the parameters are wrong
     "sensor": ("the sensor is at fault", "the sensor stands out"),
     "actuator": ("the actuators are at fault", "the actuators stand out"),
@@ -52,6 +54,8 @@ class Check(Displayed):
         standardised: the residuals themselves, one set, with the variables that the regimes are ranges of.
         stuck: stretches of the table in which nothing was measured though something is written.
         outliers: readings that no noise of the sensors explains; nothing else is about them.
+        fitted: how well the drives of its fit determine the program's parameters; None where nobody said.
+        unseen: whether the parameters' uncertainty counts, for it was not fitted to these drives.
         notes: what was left out.
     """
 
@@ -70,6 +74,8 @@ class Check(Displayed):
     standardised: Residuals
     stuck: list[Stretch]
     outliers: Outliers
+    fitted: ParameterInformation | None
+    unseen: bool
     notes: list[str]
 
     @property
@@ -87,6 +93,8 @@ class Check(Displayed):
             "program": type(self.program).__name__,
             "trajectories": len(self.data),
             "simulations": len(misfit.simulated),
+            "parameter_uncertainty": self.unseen,
+            "gain_of_longer_fit": self.fitted.gain if self.fitted else None,
             "measurements": {name: _component(self, i) for i, name in enumerate(self.program.measurement_names)},
             "constant_velocity": about | {"loses_to_it": lost_horizons(self)},
             "findings": [
@@ -236,9 +244,9 @@ def verdict(found: Check) -> str:
         said = "The program does not explain these drives: "
         if blame.p_values["parameters"] <= LEVEL_OF_TEST:
             (fault, _), (_, beside) = VERDICTS["parameters"], VERDICTS[blame.kind]
-            said += f"{fault}{_parameters(blame)}: fit it again first (more --steps, or --recipe likelihood)"
+            said += f"{fault}{_parameters(blame)}{_of_fit(found.fitted)}"
             said += f"; beside them {beside}{_most_clearly(blame)}" if beside else ""
-            said += f"; if that changes little, {discover}"
+            said += f"; {discover}" if _is_done(found.fitted) else f"; if that changes little, {discover}"
         else:
             of_noise = "the effects of kind noise in `steady discover` say in which way"
             next_command = of_noise if blame.kind == "noise" else discover
@@ -246,6 +254,21 @@ def verdict(found: Check) -> str:
     if loses := lost_horizons(found):
         said += f"; it predicts worse than a vehicle that just keeps its velocity ({', '.join(loses)} ahead)"
     return f"{first}{said}."
+
+
+def _is_done(fitted: ParameterInformation | None) -> bool:
+    """Whether a longer fit would gain nothing."""
+    return fitted is not None and fitted.gain < MIN_GAIN_OF_FIT
+
+
+def _of_fit(fitted: ParameterInformation | None) -> str:
+    """What to do where parameters do not suit: what a fit that has ended leaves is structure."""
+    again = "fit it again first (more --steps, or --recipe likelihood)"
+    if fitted is None:
+        return f": {again}"
+    if _is_done(fitted):
+        return ", though on its own drives its fit has ended: what it lacks is no number of it"
+    return f", and its fit had not ended (a longer one gains {fitted.gain:.2g} nats): {again}"
 
 
 def _most_clearly(blame: Attribution) -> str:

@@ -6,6 +6,7 @@ time goes on at the last step, controls and measurements are zero, nothing is ob
 
 from __future__ import annotations
 
+import hashlib
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -18,6 +19,7 @@ from torch.nn.utils.rnn import pad_sequence
 from steady_ppl.errors import DataError
 from steady_ppl.utils.context import Displayed
 
+DIGITS_OF_DIGEST = 16  # hexadecimal: two of a million trajectories are alike by chance once in ten million tables
 MAX_STEP_RATIO = 1.25  # ratio of the drives' steps up to which they count as one
 
 
@@ -61,6 +63,19 @@ class Trajectories(Displayed):
             f"({int((~self.observed[self.rows]).sum())} missing), "
             f"states {list(self.state_names) if self.states is not None else 'unknown'})"
         )
+
+    @property
+    def digests(self) -> tuple[str, ...]:
+        """A hash of what was measured on each trajectory and under which controls, the same in any table."""
+        found, of_rows = [], (self.measurements, self.observed)
+        of_intervals = (self.steps, self.controls[:-1])
+        for index, length in enumerate(self.lengths.tolist()):
+            parts = [values[: length - 1, index] for values in of_intervals] + [
+                values[:length, index] for values in of_rows
+            ]
+            content = b"".join(part.numpy(force=True).tobytes() for part in parts)
+            found.append(hashlib.sha256(content).hexdigest()[:DIGITS_OF_DIGEST])
+        return tuple(found)
 
     @property
     def rows(self) -> Tensor:

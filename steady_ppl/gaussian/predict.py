@@ -1,7 +1,7 @@
 """Measurements predicted from the rows before them, some rows ahead, and drives simulated to compare with."""
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -90,12 +90,29 @@ def row_errors(program: Program, states: Tensor, measurements: Tensor, observed:
     return on_all_rows(program, "errors", partial(errors, program), given).values
 
 
-@torch.no_grad()
 def simulate_again(
     program: Program, data: Trajectories, starts: Tensor, channels: int
 ) -> tuple[Trajectories, ReferencePath]:
     """`M · B` drives that the program makes of the same controls from starts `(M, B, D)` with C noise channels, with
     the same gaps in the measurements, all of the first set first; and their true paths."""
+    return simulate_each([program], data, [starts], channels)
+
+
+@torch.no_grad()
+def simulate_each(
+    programs: Iterable[Program], data: Trajectories, starts: Sequence[Tensor], channels: int
+) -> tuple[Trajectories, ReferencePath]:
+    """Some sets of each program, one after the other, see `simulate_again`; `starts` are `(·, B, D)` for each."""
+    sets, drives = sum(map(len, starts)), len(data)
+    parts = [_rolled_out(program, begin, data, channels) for program, begin in zip(programs, starts, strict=True)]
+    path, noise, drawn = (torch.cat(one, 1) for one in zip(*parts, strict=True))
+    again = data.subset(torch.arange(drives).repeat(sets))
+    again = replace(again, measurements=torch.where(again.observed, drawn, 0.0), states=path)
+    return again.without_truth(keep_start=True), ReferencePath(path, noise)
+
+
+def _rolled_out(program: Program, starts: Tensor, data: Trajectories, channels: int) -> tuple[Tensor, Tensor, Tensor]:
+    """States, noise and measurements of some sets of drives, sets and drives in one dimension."""
     sets, drives, _ = starts.shape
     stepping = Stepping(program, data, 1.0)
     states, noises = [starts.to(data.controls.dtype)], []
@@ -105,10 +122,7 @@ def simulate_again(
         states.append(torch.where(data.transitions[row, :, None], moved, starts.to(moved)))
         noises.append(torch.where(data.transitions[row, :, None], noise, 0.0))
     path = torch.stack(states).flatten(1, 2)
-    drawn = measure(program, path)
-    again = data.subset(torch.arange(drives).repeat(sets))
-    again = replace(again, measurements=torch.where(again.observed, drawn, 0.0), states=path)
-    return again.without_truth(keep_start=True), ReferencePath(path, torch.stack(noises).flatten(1, 2))
+    return path, torch.stack(noises).flatten(1, 2), measure(program, path)
 
 
 @torch.no_grad()
@@ -118,9 +132,3 @@ def on_a_circle(program: Program, data: Trajectories, states: Tensor) -> Tensor:
     measured = torch.full_like(data.measurements[:1, :1], 0.3)
     change = errors(program, one, measured + 2 * math.pi, every) - errors(program, one, measured, every)
     return (change.abs() < 1e-3).flatten()
-
-
-def named_horizons(data: Trajectories, seconds: Sequence[float]) -> dict[str, int]:
-    """Name → rows ahead: one step, and those times that fit into the longest drive."""
-    rows = {f"{one:g} s": data.rows_ahead(one) for one in seconds}
-    return {"one step": 1} | {name: count for name, count in rows.items() if 1 < count < data.time.shape[0]}

@@ -211,6 +211,7 @@ def report(
     notes: Sequence[str] = (),
     simulations: int = 100,
     draws: int = 50,
+    horizons: Sequence[float] = (),
     seed: int = 0,
 ) -> Report:
     """Say on one page what fitted programs explain of some drives, where they fail and what they lack.
@@ -225,6 +226,7 @@ def report(
         notes: shown above everything else.
         simulations: sets of drives simulated for the bands of each run's `check`.
         draws: of the posterior of each run's states.
+        horizons: seconds ahead; those that suit the drives where none is given, see `data.horizons`.
         seed: of simulations, draws and resampling.
 
     Raises:
@@ -245,7 +247,7 @@ def report(
         checks = {}
         for label, fit in runs.items():
             begin()
-            checks[label] = check(fit, data, simulations=simulations, seed=seed)
+            checks[label] = check(fit, data, simulations=simulations, horizons=horizons, seed=seed)
             data = checks[label].outliers.without(data)  # what a run finds wrong is left out for all that follow
         shown = chosen_drives(list(checks.values()))
         drawn = []
@@ -256,7 +258,8 @@ def report(
         proof: Proof | str = "There is one run only: name the run before and the one after to compare them."
         if len(runs) > 1:
             try:
-                proof = prove(runs, data, paths={label: one.path for label, one in checks.items()}, seed=seed)
+                paths = {label: one.path for label, one in checks.items()}
+                proof = prove(runs, data, paths=paths, horizons=horizons, seed=seed)
             except SteadyError as error:
                 proof = f"The runs cannot be compared: {error}."
     return Report(

@@ -18,16 +18,27 @@ import torch
 from steady_ppl import effects
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.errors import RunError
+from steady_ppl.likelihood.information import ParameterInformation
 from steady_ppl.model.loading import load_program
 from steady_ppl.model.program import Program
 from steady_ppl.model.substeps import is_count
 from steady_ppl.runs.export import Dynamics
-from steady_ppl.runs.folder import FINISHED, PARAMETERS, POSTERIOR, RUN_RECORD, read_record, run_folder, write_record
+from steady_ppl.runs.folder import (
+    FINISHED,
+    INFORMATION,
+    PARAMETERS,
+    POSTERIOR,
+    RUN_RECORD,
+    read_record,
+    run_folder,
+    write_record,
+)
 from steady_ppl.training.loop import Trained
 from steady_ppl.utils.context import Displayed
 from steady_ppl.utils.cores import one_thread
 from steady_ppl.utils.files import whole_file
-from steady_ppl.utils.tensor_files import read_tensors, write_tensors
+from steady_ppl.utils.tensor_files import damaged, read_tensors, write_tensors
+from steady_ppl.utils.text import reason_of
 
 if TYPE_CHECKING:
     import arviz
@@ -42,6 +53,7 @@ class Fit(Displayed):
         known_start: whether the true first state was given.
         trained: the history; None for a recipe that does not train.
         notes: anything that was rescued, replaced or left out on the way.
+        information: how well the drives determine the parameters; None where the recipe does not say.
     """
 
     program: Program
@@ -51,6 +63,7 @@ class Fit(Displayed):
     known_start: bool = False
     trained: Trained | None = None
     notes: list[str] = field(default_factory=list)
+    information: ParameterInformation | None = None
 
     def __repr__(self) -> str:
         return f"Fit({self.program}, recipe={self.recipe!r})"
@@ -97,6 +110,8 @@ class Fit(Displayed):
     ) -> None:
         """Write into an open run folder; `begun` is what its record already says."""
         write_tensors(folder / PARAMETERS, self.program.state_dict())
+        if self.information is not None:
+            write_tensors(folder / INFORMATION, *self.information.as_tensors())
         if train is not None:
             from steady_ppl.runs.posterior import drawn_states, netcdf
 
@@ -162,7 +177,13 @@ class Fit(Displayed):
         if record["kept_step"] is not None:
             trained = Trained(record["history"], record["kept_step"], record["status"] == "interrupted")
         kept = {name: record[name] for name in ("recipe", "settings", "seed", "known_start", "notes")}
-        return cls(program, trained=trained, **kept)
+        information = None
+        if (folder / INFORMATION).exists():
+            try:
+                information = ParameterInformation.from_tensors(*read_tensors(folder / INFORMATION))
+            except (KeyError, ValueError, TypeError) as error:
+                raise damaged(folder / INFORMATION, reason_of(error)) from error
+        return cls(program, trained=trained, information=information, **kept)
 
 
 def program_source(program: Program, folder: Path) -> dict[str, str] | None:

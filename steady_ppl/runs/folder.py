@@ -17,8 +17,9 @@ from steady_ppl.utils.schema import ANYTHING, BOOL, LINES, TEXT, WHOLE, mismatch
 from steady_ppl.utils.tensor_files import read_tensors
 
 PARAMETERS, RUN_RECORD, POSTERIOR = "parameters.safetensors", "run.json", "posterior.nc"
+INFORMATION = "information.safetensors"
 CHECKPOINT, DISCOVERY = "checkpoint.safetensors", "discovery.json"
-FILES = (PARAMETERS, RUN_RECORD, POSTERIOR, CHECKPOINT, DISCOVERY)
+FILES = (PARAMETERS, INFORMATION, RUN_RECORD, POSTERIOR, CHECKPOINT, DISCOVERY)
 BACKUP, LOCK, JOURNAL = "previous", ".lock", "journal"
 
 RUN_FORMAT = 1  # number of the record's format
