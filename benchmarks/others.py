@@ -29,6 +29,7 @@ from resumable import Record, digest, run
 
 RESULT = Path(__file__).parent / "results" / "others.jsonl"
 MAX_CPU, MAX_MEMORY = 300.0, 2048.0  # seconds and MiB that MRCLAM's search may take
+MRCLAM_MINUTES = 4.5  # after which its search is told to end
 MAX_MILLIVOLTS = 5.5  # of Silverbox's free run on the multisine
 MAX_SD = 5.0  # kg, of EMPS's mass: less says nothing
 PROGRESS = re.compile(r"steady: [^…]*… [\w ]+ gone by(, about (to end|[\w ]+ left))?\s*")
@@ -186,7 +187,7 @@ CASES = {
         },
         _victoria_park,
     ),
-    "mrclam": Case({"discover": f"discover robot.py {DISCOVER}"}, _mrclam, is_limited=True),
+    "mrclam": Case({"discover": f"discover robot.py {DISCOVER} --minutes {MRCLAM_MINUTES}"}, _mrclam, is_limited=True),
     "silverbox": Case({"discover": f"discover silverbox.py {DISCOVER}", "free": RUN_FREE}, _silverbox),
     "silverbox_rescaled": Case(
         {"discover": f"discover slow.py {DISCOVER}", "free": RUN_FREE}, _silverbox, "slow_{}.csv"

@@ -82,7 +82,11 @@ def judged(name: str, vehicle: str, setting: Setting, index: int) -> Record:
     fitted = time.perf_counter()
     found = check(fit, others, seed=index)
     said = found.figures
-    record: Record = {"vehicle": vehicle, "setting": setting.name, "seconds": [fitted - began, time.perf_counter() - fitted]}
+    record: Record = {
+        "vehicle": vehicle,
+        "setting": setting.name,
+        "seconds": [fitted - began, time.perf_counter() - fitted],
+    }
     record |= {"who": said["who"], "p_value": said["p_value"], "p_values": said["evidence"]["p_values"]}
     record |= {"step": bool(found.step.sentence), "gain": said["gain_of_longer_fit"], "verdict": said["verdict"]}
     if planted is not None:

@@ -2,9 +2,11 @@
 
 import errno
 import shlex
-from collections.abc import Collection, Mapping, Sequence
-from contextlib import suppress
+import signal
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from pathlib import Path
+from threading import Event
 from typing import Annotated, Any
 
 import typer
@@ -97,6 +99,27 @@ def read_drives(table: Path, program: "st.Program", known: Collection[str] = ())
         others = f"{len(found) - 1} more; " if len(found) > 1 else ""
         say(f"{table.name}: {found[0]} ({others}{doctor_says})")
     return drives
+
+
+@contextmanager
+def stopped_after(minutes: float | None) -> Iterator[Event]:
+    """Interrupt the block when its time is over, as Ctrl-C does; the event says so."""
+    over = Event()
+    if minutes is None:
+        yield over
+        return
+
+    def stop(*_: object) -> None:
+        over.set()
+        raise KeyboardInterrupt(f"its {minutes:g} min are over")
+
+    before = signal.signal(signal.SIGALRM, stop)
+    signal.setitimer(signal.ITIMER_REAL, 60 * minutes)
+    try:
+        yield over
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0)
+        signal.signal(signal.SIGALRM, before)
 
 
 def write_json(path: Path, content: Any) -> None:

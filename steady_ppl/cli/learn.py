@@ -8,7 +8,7 @@ import typer
 
 import steady_ppl as st
 from steady_ppl.cli import common
-from steady_ppl.cli.common import fit_or_program, present, program_from, read_drives, write_json
+from steady_ppl.cli.common import fit_or_program, present, program_from, read_drives, stopped_after, write_json
 from steady_ppl.errors import RunError, UsageError
 from steady_ppl.utils.context import QUIET
 from steady_ppl.utils.files import require_picture, require_place, write_picture
@@ -128,6 +128,9 @@ def discover(
         list[str] | None,
         typer.Option(metavar="KIND", help="Look for one kind alone: dynamics, actuator, sensor or noise; or for some."),
     ] = None,
+    minutes: Annotated[
+        float | None, typer.Option(help="End the search after so long, with what it has found.", min=0.01)
+    ] = None,
     program: common.MovedOfRun = None,
     seed: common.Seed = 0,
     resume: Annotated[bool, typer.Option("--resume", help="Go on with a search that was stopped.")] = False,
@@ -151,7 +154,8 @@ def discover(
     settings |= {"withheld": withhold or [], "only": only or []}
     try:
         with kept_search(out, given, drives, judges, settings, force=force, resume=resume) as begun:
-            found = st.discover(given, drives, judges, **settings)
+            with stopped_after(minutes) as over:
+                found = st.discover(given, drives, judges, **settings)
             figures = {"source": source, **found.figures}
             present(str(found), figures, json_file)
             if out is not None:
@@ -172,8 +176,10 @@ def discover(
         write_picture(discovery_picture(found), picture)
     if found.search.interrupted:
         usable = "" if out is None else f"; the run so far is usable, `--resume` goes on with {out}"
-        say(f"interrupted while {found.search.interrupted}{usable}", always=True)
-        raise typer.Exit(1)
+        stopped = f"stopped after {minutes:g} min" if over.is_set() else "interrupted"
+        say(f"{stopped} while {found.search.interrupted}{usable}", always=True)
+        if not over.is_set():
+            raise typer.Exit(1)
 
 
 def add(

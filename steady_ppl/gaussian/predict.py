@@ -1,7 +1,7 @@
 """Measurements predicted from the rows before them, some rows ahead, and drives simulated to compare with."""
 
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -11,12 +11,11 @@ from torch import Tensor
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.gaussian.kalman import Tracked
 from steady_ppl.gaussian.linearize import ReferencePath
-from steady_ppl.kernels.rows import on_all_rows
+from steady_ppl.kernels.rows import function_of_rows, on_all_rows
 from steady_ppl.model.handlers import Observing, Recording, joined, residual, running
 from steady_ppl.model.program import Program
-from steady_ppl.model.substeps import RowInputs, mean_step, row_inputs
+from steady_ppl.model.substeps import RowInputs, mean_step, noisy_step, row_inputs
 from steady_ppl.smc.simulate import measure
-from steady_ppl.smc.stepping import Stepping
 
 HALF_WIDTH = 1.6448536269514729  # of a normal's 90 % interval, in standard deviations
 
@@ -104,23 +103,34 @@ def simulate_each(
 ) -> tuple[Trajectories, ReferencePath]:
     """Some sets of each program, one after the other, see `simulate_again`; `starts` are `(·, B, D)` for each."""
     sets, drives = sum(map(len, starts)), len(data)
-    parts = [_rolled_out(program, begin, data, channels) for program, begin in zip(programs, starts, strict=True)]
+    parts = [
+        _rolled_out(program, begin, data, channels, by_kernels=len(starts) > 1)
+        for program, begin in zip(programs, starts, strict=True)
+    ]
     path, noise, drawn = (torch.cat(one, 1) for one in zip(*parts, strict=True))
     again = data.subset(torch.arange(drives).repeat(sets))
     again = replace(again, measurements=torch.where(again.observed, drawn, 0.0), states=path)
     return again.without_truth(keep_start=True), ReferencePath(path, noise)
 
 
-def _rolled_out(program: Program, starts: Tensor, data: Trajectories, channels: int) -> tuple[Tensor, Tensor, Tensor]:
+def _rolled_out(
+    program: Program, starts: Tensor, data: Trajectories, channels: int, *, by_kernels: bool
+) -> tuple[Tensor, Tensor, Tensor]:
     """States, noise and measurements of some sets of drives, sets and drives in one dimension."""
     sets, drives, _ = starts.shape
-    stepping = Stepping(program, data, 1.0)
-    states, noises = [starts.to(data.controls.dtype)], []
+    state, inputs = starts.to(data.controls.dtype), row_inputs(program, data)._asdict()
+    states, noises = [state], list[Tensor]()
+    step: Callable[..., Tensor] = partial(noisy_step, program)
     for row in range(len(data.steps)):
-        noise = torch.randn(sets, drives, channels).to(states[0])
-        moved, _ = stepping.transition(row, states[-1], noise)
-        states.append(torch.where(data.transitions[row, :, None], moved, starts.to(moved)))
-        noises.append(torch.where(data.transitions[row, :, None], noise, 0.0))
+        noise = torch.randn(sets, drives, channels).to(state)
+        at_row = {name: values[row].expand(sets, *values[row].shape) for name, values in inputs.items()}
+        given = {"state": state, "noise": noise} | at_row
+        if by_kernels and row == 0:
+            step = function_of_rows(program, "end of a row", step, given)
+        inside = data.transitions[row, :, None]
+        state = torch.where(inside, step(*given.values()), states[0])
+        states.append(state)
+        noises.append(torch.where(inside, noise, 0.0))
     path = torch.stack(states).flatten(1, 2)
     return path, torch.stack(noises).flatten(1, 2), measure(program, path)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
 from functools import partial
@@ -152,6 +152,66 @@ def slopes_on_all_rows(
     return Slopes(values, components, rest.movedim(-1, 0), method.by_number(program, numbers)[parameters])
 
 
+def function_of_rows(
+    program: nn.Module, name: str, function: Callable[..., Tensor], arguments: dict[str, Tensor]
+) -> Callable[..., Tensor]:
+    """A function of rows with the program's numbers as they are now, for many calls: by a kernel where one can serve.
+
+    Args:
+        program: what the function belongs to.
+        name: of the function, by which its kernel is kept.
+        function: of one row of one trajectory or of many; it returns `(..., V)`.
+        arguments: its arguments in order, each `(rows, B)` or `(rows, B, ·)`, as they may be given to it.
+    """
+    first = next(iter(arguments.values()))
+    if _why_no_kernel(first) is not None:
+        return function
+    compiled_as, method = _method(program, f"{name} on all rows", function, arguments)
+    if isinstance(method, str):
+        return function
+    constants = method.parameters(program)
+
+    def by_kernel(*values: Tensor) -> Tensor:
+        return _called(method, constants, values)
+
+    if _differs(program, compiled_as, function, arguments, by_kernel(*arguments.values())):
+        discard(program, compiled_as)
+        return function
+    return by_kernel
+
+
+def _why_no_kernel(first: Tensor) -> str | None:
+    if first.shape[:2].numel() < SIMD_LANES:
+        return f"fewer than {SIMD_LANES} rows"
+    if first.device.type != "cpu" or first.dtype != torch.float32:
+        return f"{str(first.dtype).removeprefix('torch.')} on {first.device.type}"
+    return None
+
+
+def _method(
+    program: nn.Module,
+    compiled_as: str,
+    function: Callable[..., Tensor],
+    arguments: Mapping[str, Tensor],
+    **derivatives: Any,
+) -> tuple[str, Method | str]:
+    """The name under which a function is compiled, and its method or why there is none."""
+    examples = {at: value[:1, :1].unsqueeze(0).clone() for at, value in arguments.items()}
+    build = partial(Method, program, lambda *given: (function(*given),), examples, {}, **derivatives)
+    return compiled_as, compiled(program, compiled_as, build)
+
+
+def _called(method: Method, constants: Any, values: Iterable[Tensor]) -> Tensor:
+    """A method's results `(rows, B, ·)` of arguments `(rows, B)` or `(rows, B, ·)`."""
+    values = list(values)
+    rows, trajectories = values[0].shape[:2]
+    cells = rows * trajectories
+    inputs = [value.float().reshape(cells, 1, -1).permute(2, 1, 0).contiguous().numpy() for value in values]
+    out = torch.empty(len(method.graph.outputs), 1, cells)
+    method.kernel(constants, np.zeros((1, 0), np.float32), inputs, None, out.numpy())
+    return out.squeeze(1).t().reshape(rows, trajectories, -1)
+
+
 def _computed(
     program: nn.Module,
     name: str,
@@ -163,25 +223,16 @@ def _computed(
 ) -> tuple[Method, Tensor, Tensor] | InSteps | str | None:
     """The kernel, the function's value and the derivatives `(rows, B, ·)`; or what it comes to in steps."""
     first = next(iter(arguments.values()))
-    rows, trajectories = first.shape[:2]
-    cells = rows * trajectories
-    if not (cells >= ROWS_WORTH_COMPILING if kernels is None else kernels):
+    if not (first.shape[:2].numel() >= ROWS_WORTH_COMPILING if kernels is None else kernels):
         return None
-    if cells < SIMD_LANES:
-        return f"fewer than {SIMD_LANES} rows"
-    if first.device.type != "cpu" or first.dtype != torch.float32:
-        return f"{str(first.dtype).removeprefix('torch.')} on {first.device.type}"
-    examples = {at: value[:1, :1].unsqueeze(0).clone() for at, value in arguments.items()}
-    compiled_as = f"{name} by parameters" if "by_parameters" in derivatives else f"{name} on all rows"
-    build = partial(Method, program, lambda *given: (function(*given),), examples, {}, **derivatives)
-    method = compiled(program, compiled_as, build)
+    if why := _why_no_kernel(first):
+        return why
+    suffix = "by parameters" if "by_parameters" in derivatives else "on all rows"
+    compiled_as, method = _method(program, f"{name} {suffix}", function, arguments, **derivatives)
     if isinstance(method, str):
         stepped = method if in_steps is None else in_steps()
         return _noted(name, stepped) if isinstance(stepped, str) else stepped
-    inputs = [value.float().reshape(cells, 1, -1).permute(2, 1, 0).contiguous().numpy() for value in arguments.values()]
-    out = torch.empty(len(method.graph.outputs), 1, cells)
-    method.kernel(method.parameters(program), np.zeros((1, 0), np.float32), inputs, None, out.numpy())
-    found = out.squeeze(1).t().reshape(rows, trajectories, -1)
+    found = _called(method, method.parameters(program), arguments.values())
     values, rest = found[..., : method.values], found[..., method.values :]
     if _differs(program, method, function, arguments, values):
         return _noted(name, discard(program, compiled_as))

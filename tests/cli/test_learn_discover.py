@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import signal
+import time
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -12,7 +13,9 @@ import torch
 from examples import MODELS, example
 from small import HOVERCRAFT, simulated, steady, written
 
+import steady_ppl
 from steady_ppl import Fit, for_program, simulate, write_table
+from steady_ppl.cli.common import stopped_after
 from steady_ppl.discovery import candidates, discover, search
 from steady_ppl.errors import FilterError
 
@@ -176,6 +179,23 @@ def whole(table, tmp_path_factory):
     run = tmp_path_factory.mktemp("whole") / "run"
     assert steady("discover", MODEL, table, *FEW, "--out", run) == 0
     return json.loads((run / "discovery.json").read_text())
+
+
+def test_a_block_is_stopped_when_its_minutes_are_over() -> None:
+    began = time.monotonic()
+    with pytest.raises(KeyboardInterrupt, match="over"), stopped_after(0.005):
+        time.sleep(20)
+    assert time.monotonic() < began + 10
+    with stopped_after(None) as never, stopped_after(60.0) as later:
+        time.sleep(0.05)
+    assert not never.is_set() and not later.is_set()
+
+
+def test_a_search_that_is_stopped_before_its_first_tests_has_nothing_to_show(table, capsys, monkeypatch) -> None:
+    monkeypatch.setattr(steady_ppl, "discover", lambda *given, **settings: time.sleep(20))
+    assert steady("discover", MODEL, table, *FEW, "--minutes", 0.01) == 1
+    assert "interrupted; its 0.01 min are over" in capsys.readouterr().err
+    assert "--minutes" in refused(capsys, "discover", MODEL, table, "--minutes", 0)
 
 
 @pytest.mark.slow
