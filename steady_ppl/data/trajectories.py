@@ -67,13 +67,12 @@ class Trajectories(Displayed):
     @property
     def digests(self) -> tuple[str, ...]:
         """A hash of what was measured on each trajectory and under which controls, the same in any table."""
-        found, of_rows = [], (self.measurements, self.observed)
-        of_intervals = (self.steps, self.controls[:-1])
+        found = []
         for index, length in enumerate(self.lengths.tolist()):
-            parts = [values[: length - 1, index] for values in of_intervals] + [
-                values[:length, index] for values in of_rows
-            ]
-            content = b"".join(part.numpy(force=True).tobytes() for part in parts)
+            parts = [values[:length, index] for values in (self.measurements, self.observed)]
+            content = b"".join(
+                part.numpy(force=True).tobytes() for part in [self.controls[: length - 1, index], *parts]
+            )
             found.append(hashlib.sha256(content).hexdigest()[:DIGITS_OF_DIGEST])
         return tuple(found)
 

@@ -31,7 +31,8 @@ def test_fit_leaves_a_run_that_names_its_recipe(tmp_path: Path, work: Path, caps
     record = json.loads((run / "run.json").read_text())
     assert (record["recipe"], record["status"], record["seed"]) == (recipe, "finished", 4)
     expected = {"parameters.safetensors", "posterior.nc", "run.json"}
-    assert set(contents(run)) == expected | ({"checkpoint.safetensors"} if options else set())
+    expected |= {"checkpoint.safetensors"} if options else set()
+    assert set(contents(run)) == expected | ({"information.safetensors"} if recipe == "steady" else set())
 
 
 def test_fit_tells_the_held_out_likelihood(tmp_path: Path, work: Path, capsys) -> None:

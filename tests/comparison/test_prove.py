@@ -308,3 +308,60 @@ def test_a_table_that_a_run_was_fitted_to_proves_nothing(tmp_path, work, capsys)
     assert steady("prove", tmp_path / "given", tmp_path / "seen", table) == 0
     said = " ".join(capsys.readouterr().out.split())
     assert "note: seen was fitted to this very table" in said and "given was fitted" not in said
+
+
+def by_particles(proof, name: str, change: float | str):
+    """A proof in which a particle filter sees so many nats more a drive than the linearised program."""
+    row = proof.rows[name]
+    sums = {key: value for key, value in row.sums.items() if key.kind != "log_likelihood_by_particles"}
+    if isinstance(change, str):
+        return replace(proof, rows=proof.rows | {name: replace(row, sums=sums, neglected=change)})
+    likely = row.sums[Key("log_likelihood", "", 0)]
+    sums[Key("log_likelihood_by_particles", "", 0)] = replace(likely, total=likely.total + change)
+    left = torch.full((len(likely.total),), change, dtype=torch.float64)
+    return replace(proof, rows=proof.rows | {name: replace(row, sums=sums, neglected=left)})
+
+
+def test_particles_rule_where_they_see_log_p_y_otherwise(drag) -> None:
+    gain = line(drag, "after")["against_reference"]["log_likelihood"]["difference"]
+    said = by_particles(drag, "after", -gain - 50.0).figures["verdict"]
+    assert said.startswith("after fits worse and predicts better than before: log p(y) (by particles; linearised +")
+    assert "−50.0 nats a drive" in said
+    assert "particles" not in by_particles(drag, "after", 0.5).figures["verdict"]
+
+
+@pytest.mark.parametrize("who", ["before", "after"])
+def test_a_program_that_no_filter_follows_is_named_in_the_sentence(drag, who: str) -> None:
+    found = by_particles(drag, who, "its weights blew up")
+    assert f"no particle filter follows {who}, so that log p(y) says nothing" in found.figures["verdict"]
+    assert found.figures["verdict"].startswith("after is better than before: ")  # by its predictions
+    infinite = by_particles(drag, who, math.nan)
+    assert "by particles log p(y) is not finite" in infinite.figures["verdict"]
+
+
+@pytest.mark.parametrize("factor", [0.02, 0.03, 0.05, 0.1, 0.2])
+def test_programs_that_lose_to_what_knows_nothing_are_said_to_be_no_models(dragged, factor: float) -> None:
+    wrong, worse = hovercraft(), hovercraft()
+    wrong.mass, worse.mass = (torch.tensor(1.5 * size) for size in (factor, 0.8 * factor))
+    found = prove({"before": worse, "after": wrong}, dragged, known_start=True)
+    assert found.figures["verdict"].startswith("Neither before nor after is yet a model: 3 s ahead both err more than ")
+    only = prove({"before": hovercraft(), "after": wrong}, dragged, known_start=True)
+    assert only.figures["verdict"].startswith("after is not yet a model: 3 s ahead it errs more than ")
+    back = prove({"before": wrong, "after": hovercraft()}, dragged, known_start=True)
+    assert "yet a model" not in back.figures["verdict"]
+
+
+def test_the_last_measurement_is_a_row_of_its_own(drag, dragged) -> None:
+    row = line(drag, "last measurement")
+    rows, values = drag.horizons["1 s"], for_program(hovercraft(), dragged).measurements.double()
+    apart = torch.remainder(values[rows:] - values[:-rows] + math.pi, 2 * math.pi) - math.pi
+    assert row["measurement"]["rad"]["1 s"] == pytest.approx(float(apart.square().mean().sqrt()), rel=1e-5)
+    assert row["log_likelihood"] is None and row["scales"] == {"channels": {}, "measurements": {}}
+    with pytest.raises(st.UsageError, match="last measurement"):
+        prove({"before": hovercraft(), "last measurement": hovercraft()}, dragged)
+
+
+def test_times_ahead_may_be_asked_for(dragged) -> None:
+    found = prove({"a": hovercraft(), "b": hovercraft()}, dragged, known_start=True, horizons=[0.5, 2.0])
+    assert list(found.horizons) == ["one step", "0.5 s", "2 s"]
+    assert "2-s open-loop error" in found.figures["verdict"]

@@ -16,6 +16,7 @@ from oracles import assert_mean, cart_parameters, kalman
 from small import finite
 
 import steady_ppl as st
+from steady_ppl import for_program
 from steady_ppl.criticism.baselines import ConstantVelocity, Reference, constant_velocity
 from steady_ppl.criticism.check import _in_own_spreads
 from steady_ppl.criticism.residual_maps import Residuals
@@ -23,6 +24,8 @@ from steady_ppl.gaussian.kalman import track
 from steady_ppl.gaussian.linearize import ReferencePath
 from steady_ppl.gaussian.smoother import find_path
 from steady_ppl.kernels.rows import kernel_failures
+from steady_ppl.likelihood.information import ParameterInformation
+from steady_ppl.likelihood.parameters import elements, set_values, values_of
 from steady_ppl.model.problem import Problem
 
 CHANCE = 1e-4
@@ -336,3 +339,56 @@ def test_a_program_whose_noise_is_not_normal_is_refused(cart, even):
 
     with pytest.raises(st.UsageError, match="check needs a program that can be linearised: .*StudentT"):
         st.check(fitted(Heavy().double().requires_grad_(False)), even)
+
+
+def known_by(fit: st.Fit, data: st.Trajectories, size: float, gain: float = 0.0) -> st.Fit:
+    """A fit whose own drives leave each number open by a share of it."""
+    parts = elements(fit.program)
+    matrix = size**-2 * torch.eye(len(parts), dtype=torch.float64)
+    return replace(fit, information=ParameterInformation(tuple(p.name for p in parts), matrix, gain, set(data.digests)))
+
+
+@pytest.fixture(scope="module")
+def off() -> tuple[st.Fit, st.Trajectories]:
+    """A cart whose numbers are off by some per cent, as a fit to few drives leaves them, and many other drives."""
+    cart = example("linear_gaussian", torch.float32)
+    data = st.simulate(cart, 40, seed=8)
+    parts = elements(cart)
+    set_values(parts, values_of(parts) + torch.tensor([0.06, -0.06, 0.0, 0.0]).double())
+    return st.Fit(cart, "likelihood", known_start=True), data
+
+
+def test_what_a_fit_could_not_know_is_no_fault(off) -> None:
+    fit, data = off
+    sure = st.check(fit, data, simulations=40)
+    assert sure.blame.kind == "parameters" and "fit it again first" in str(sure)
+    others = st.simulate(fit.program, 3, seed=9)
+    open_ = st.check(known_by(fit, for_program(fit.program, others), 0.1), data, simulations=40)
+    assert open_.unseen and open_.blame.p_values["parameters"] > 0.05
+    assert open_.figures["parameter_uncertainty"] is True
+
+
+def test_on_its_own_drives_a_fits_uncertainty_does_not_count(off) -> None:
+    fit, data = off
+    found = st.check(known_by(fit, for_program(fit.program, data), 0.1), data, simulations=40)
+    assert not found.unseen and found.blame.kind == "parameters"
+
+
+@pytest.mark.parametrize(
+    ("gain", "says"),
+    [
+        (0.01, "though on its own drives its fit has ended: what it lacks is no number of it; `steady discover`"),
+        (7.0, "and its fit had not ended (a longer one gains 7 nats): fit it again first"),
+    ],
+)
+def test_a_fit_that_has_ended_is_not_sent_back(off, gain: float, says: str) -> None:
+    fit, data = off
+    others = for_program(fit.program, st.simulate(fit.program, 3, seed=9))
+    found = st.check(known_by(fit, others, 1e-3, gain), data, simulations=40)
+    assert found.blame.kind == "parameters" and says in str(found).replace("\n", " ")
+    assert found.figures["gain_of_longer_fit"] == gain
+
+
+def test_times_ahead_may_be_asked_for(cart, even) -> None:
+    found = st.check(fitted(cart), even, simulations=20, horizons=[0.7])
+    assert list(found.horizons) == ["one step", "0.7 s"]

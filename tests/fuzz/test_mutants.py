@@ -98,6 +98,7 @@ OF_CART = {"program": CART, "table": "t.csv", "run": "before", "other": "after"}
 OF_HOVERCRAFT = {"program": HOVER, "table": "h.csv", "run": "hover", "other": "hover_too"}
 SHOWN = commands("report before t.csv --discovery found.json --simulations 20 --out out/page.html")
 SEARCHED = commands("{search} searched --resume")
+CHECKED = commands("check after t.csv --simulations 20 --json out/check.json")
 RESUMED: tuple[Words, ...] = ((*TRAINING, "begun", "--resume"),)
 RUN, STUDIED, PROGRAM = commands(ON_RUN, run="before"), commands(ON_STUDY), commands(ON_PROGRAM)
 MAPPED, LOG = commands(ON_BAG, bag="mcap_file.mcap")[:1], commands("data alpha-truck logs --out out/logs.csv")
@@ -108,6 +109,7 @@ KINDS = (
     Kind("before/run.json", RECORD | BYTES, RUN),
     Kind("before/parameters.safetensors", TENSORS | BYTES, RUN),
     Kind("before/posterior.nc", BYTES, RUN),
+    Kind("after/information.safetensors", TENSORS | BYTES, CHECKED),
     Kind("begun/checkpoint.safetensors", TENSORS | BYTES, RESUMED),
     Kind("begun/run.json", JSON, RESUMED),
     Kind("searched/journal/000001.safetensors", TENSORS | BYTES, SEARCHED),
