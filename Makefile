@@ -10,7 +10,7 @@ export OMP_NUM_THREADS ?= 1
 TORCH := $(shell sed -n 's/^\(torch==[^ ]*\).*/\1/p' requirements/torch.txt)
 PIP := $(BIN)/python -m pip --quiet --disable-pip-version-check
 
-.PHONY: demo test test-slow test-all calibrate learn learn-truck truck paper lint types check wheel docs lock audit clean
+.PHONY: demo test test-slow test-share test-all calibrate learn learn-truck truck paper lint types check wheel docs lock audit clean
 
 # Every package is checked by its hash, and none is built but this one. torch is fetched first, for pip would pass over a
 # CPU build that an index offers without saying its hash, and not at all where a build of its version is installed. The
@@ -51,6 +51,9 @@ test-slow: $(INSTALLED)
 
 test-all: $(INSTALLED)
 	$(BIN)/python -m pytest --numprocesses 2 --dist loadfile --no-loadscope-reorder -m "slow or not slow" --durations 25
+
+test-share: $(INSTALLED)
+	$(BIN)/python -m pytest --numprocesses 2 --dist worksteal -m exhaustive --share $(SHARE) --durations 25
 
 calibrate: $(INSTALLED)
 	$(BIN)/python benchmarks/calibrate.py $(if $(QUICK),--quick) --results $(OUT)/calibration.jsonl
