@@ -82,13 +82,13 @@ def _improvement(chosen: BenchmarkSet, found: Discovery, test: Any) -> dict[str,
     if found.shape is not None and found.search.curve and isinstance(found.search.curve.refit, Refit):
         rows["after"] = found.search.curve.refit.mean_program()
     rows["oracle"] = found.before.program if isinstance(oracle, str) else oracle.mean_program()
-    proof = prove(rows, for_program(owner(), test), known_start=True, with_constant_velocity=False)
+    proof = prove(rows, for_program(owner(), test), known_start=True, with_constant_velocity=False, horizons=(1.0, 3.0))
     errors = {}
     for row in proof.figures["rows"]:
         (measured,) = row["measurement"].values()
         errors[row["row"]] = {
             "open_loop_3s": measured.get("3 s"),
-            "location_3s": row["state"]["location"].get("3 s"),
+            "location_3s": row["state"].get("location", {}).get("3 s"),
             "log_likelihood": row["log_likelihood"],
         }
     gain = None if isinstance(oracle, str) else float((oracle.held_out - found.search.base.held_out).sum())

@@ -32,7 +32,7 @@ MAX_CPU, MAX_MEMORY = 300.0, 2048.0  # seconds and MiB that MRCLAM's search may 
 MRCLAM_MINUTES = 4.5  # after which its search is told to end
 MAX_MILLIVOLTS = 5.5  # of Silverbox's free run on the multisine
 MAX_SD = 5.0  # kg, of EMPS's mass: less says nothing
-PROGRESS = re.compile(r"steady: [^…]*… [\w ]+ gone by(, about (to end|[\w ]+ left))?\s*")
+PROGRESS = re.compile(r"steady: (?:(?!steady: )[^…])*… [\w ]+ gone by(, about (to end|[\w ]+ left))?\s*")
 MASS = """
 import sys
 from steady_ppl import Fit, for_program, read_table, seeded
@@ -183,7 +183,7 @@ CASES = {
         {
             "fit": "fit car.py {train} --valid {valid} --recipe likelihood --out {out}/before",
             "discover": f"discover {{out}}/before {DISCOVER}",
-            "prove": "prove {out}/before {out}/after test.csv --json {out}/prove.json",
+            "prove": "prove {out}/before {out}/after test.csv --horizon 3 --json {out}/prove.json",
         },
         _victoria_park,
     ),

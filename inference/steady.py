@@ -144,9 +144,11 @@ def fit(
         )
     if guide == "gaussian" and not trained.interrupted:
         notes += doubts(program, data, known_start, seed, "guide=lookahead")
-    with seeded(seed, "information"):
-        information, unknown = information_of_fit(Problem(program, data, known_start).without_truth())
-    notes += unknown
+    information = None
+    if not trained.interrupted:
+        with seeded(seed, "information"):
+            information, unknown = information_of_fit(Problem(program, data, known_start).without_truth())
+        notes += unknown
     return Fit(program, "steady", settings, seed, known_start, trained, notes, information)
 
 

@@ -12,13 +12,14 @@ from typing import Annotated, Any
 import typer
 
 import steady_ppl as st
-from steady_ppl.errors import ComputationError, DataError, SteadyError, UsageError
+from steady_ppl.errors import ComputationError, DataError, SteadyError, UsageError, require
 from steady_ppl.utils.files import finite_json, whole_file
 from steady_ppl.utils.text import say, shown, tell
 
 NO_SPACE = (errno.ENOSPC, errno.EFBIG, errno.EDQUOT)
 NO_MEMORY = ("can't allocate memory", "not enough memory", "out of memory", "Storage size calculation overflowed")
 MAX_COUNT = 10**9  # of whatever an option counts
+MAX_MINUTES = 1e5  # after which a command ends: ten weeks
 
 
 def count(help: str, least: int = 1) -> Any:
@@ -108,6 +109,9 @@ def stopped_after(minutes: float | None) -> Iterator[Event]:
     if minutes is None:
         yield over
         return
+    require(0 < minutes <= MAX_MINUTES, "--minutes", minutes, f"a time up to {MAX_MINUTES:g}")
+    if not hasattr(signal, "setitimer"):
+        raise UsageError("--minutes: this system has no timers that interrupt; Ctrl-C does the same")
 
     def stop(*_: object) -> None:
         over.set()

@@ -196,8 +196,8 @@ def _summary(figures: Mapping[str, Any]) -> list[str]:
     lines = [[*header, f"{group}, {far} [{figures['units'][group]}]", f"σ {channel}"]]
     for row in rows:
         errors = [row["measurement"][unit].get(name) for name in ahead]
-        values = [*errors, row["state"][group].get(far), row["scales"]["channels"].get(channel)]
-        lines.append([row["row"], f"{row['log_likelihood']:.1f}", *(figure(value, ".3g") for value in values)])
+        values = [*errors, row["state"].get(group, {}).get(far), row["scales"]["channels"].get(channel)]
+        lines.append([row["row"], figure(row["log_likelihood"], ".1f"), *(figure(value, ".3g") for value in values)])
     return aligned(lines)
 
 

@@ -18,16 +18,17 @@ from steady_ppl.comparison.scores import (
     Judged,
     ProgramScores,
     as_row,
+    held_measurements,
     judge_constant_velocity,
     judge_program,
     noise_floor,
     row_of_last_measurement,
 )
-from steady_ppl.data.horizons import named_horizons
 from steady_ppl.data.table import refuse_long
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.errors import DataError, UsageError
 from steady_ppl.gaussian.linearize import ReferencePath
+from steady_ppl.gaussian.predict import suited_horizons
 from steady_ppl.model.problem import Problem
 from steady_ppl.model.program import Program, for_program
 from steady_ppl.runs.diagnostics import diagnose_units
@@ -97,7 +98,7 @@ def prove(
             same = next((other for other in judged if programs[other] is program), None)
             path = (paths or {}).get(name)
             problem = Problem(program, for_program(program, data), known_start)
-            ahead = ahead or named_horizons(problem.data, PROOF_HORIZONS, horizons)
+            ahead = ahead or suited_horizons(program, problem.data, PROOF_HORIZONS, horizons)
             judged[name] = judged[same] if same else judge_program(name, problem, ahead, seed, path)
         begin()
         before, true = judged[reference], judged.get(truth or "")
@@ -107,11 +108,11 @@ def prove(
     floor = noise_floor(true, seed) if true else None
     absent = {CONSTANT_VELOCITY: coasting, NOISE_FLOOR: floor}
     notes += [f"no row {name!r}: {why}" for name, why in absent.items() if isinstance(why, str)]
-    counted = _counted(judged.values())
-    found = {name: as_row(row, counted) for name, row in judged.items()}
-    found[LAST_MEASUREMENT] = row_of_last_measurement(before, counted)
+    counted, held = _counted(judged.values()), held_measurements(before)
+    found = {name: as_row(row, counted, held) for name, row in judged.items()}
+    found[LAST_MEASUREMENT] = row_of_last_measurement(before, counted, held)
     if isinstance(floor, Judged):
-        found[NOISE_FLOOR] = as_row(floor, _counted([floor]))
+        found[NOISE_FLOOR] = as_row(floor, _counted([floor]), held_measurements(floor))
     drives = before.problem.data
     notes += drives.uneven_steps + diagnose_units(before.problem.program, drives)
     notes += _few_rows(drives, ahead, known_start) + unconverged(rows) + _blown_up(found) + doubtful(found, data)

@@ -3,12 +3,23 @@
 import itertools
 import textwrap
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from torch import Tensor
 
-from steady_ppl.comparison.scores import BANDED_HORIZONS, COVERAGE, RESAMPLES, Change, Key, ProgramScores, paired
+from steady_ppl.comparison.scores import (
+    BANDED_HORIZONS,
+    BY_PARTICLES,
+    COVERAGE,
+    MEASURED_BEFORE,
+    RESAMPLES,
+    Change,
+    Key,
+    ProgramScores,
+    Sums,
+    paired,
+)
 from steady_ppl.effects import attached
 from steady_ppl.model.program import error_indices
 from steady_ppl.utils.context import Displayed
@@ -18,11 +29,10 @@ NAME_COLUMNS = 20  # characters of a row's name
 NOISE_FLOOR, CONSTANT_VELOCITY, LAST_MEASUREMENT = "noise floor", "constant velocity", "last measurement"
 """Rows that `prove` adds; a model has to beat the last two."""
 BASELINE_ROWS = (NOISE_FLOOR, CONSTANT_VELOCITY, LAST_MEASUREMENT, "oracle", "truth")  # that show what is possible
-MAX_DOUBT = 2.0  # nats a drive by which particles may see a difference of log p(y) otherwise
-BY_PARTICLES = Key("log_likelihood_by_particles", "", 0)
-SIMPLE_ROWS = {  # what knows nothing of the vehicle, in words
-    CONSTANT_VELOCITY: "a vehicle that keeps its velocity",
-    LAST_MEASUREMENT: "the last measurement",
+MAX_DOUBT = 2.0  # nats a drive by which particles may see a difference of log p(y) otherwise, surely
+SIMPLE_ROWS = {  # what knows nothing of the vehicle: the errors to compare, and what it is in words
+    CONSTANT_VELOCITY: ("measurement", "a vehicle that keeps its velocity"),
+    LAST_MEASUREMENT: (MEASURED_BEFORE, "the last measurement"),
 }
 PHRASES_OF_SIGNS = {  # the signs of what log p(y) and the error gained
     (0, 0): ("is not shown to help", "is not shown to be better than"),
@@ -106,7 +116,7 @@ class Proof(Displayed):
             header = [with_unit(title, unit), *far, *(f"{name}, differs" for name in far)]
             cells = [[row["row"], *_errors(row, kind, of, far)] for row in rows if of in row[kind]]
             lines += [*_table([header, *cells]), ""] if cells else []
-        lines += _scales([row for row in rows if row["row"] != NOISE_FLOOR])
+        lines += _scales([row for row in rows if row["row"] not in (NOISE_FLOOR, LAST_MEASUREMENT)])
         for note in self.notes:
             lines += textwrap.wrap(f"note: {note}", TEXT_WIDTH)
         return "\n".join(lines)
@@ -136,7 +146,7 @@ def _by_key(found: Proof, values: Mapping[Key, Any]) -> dict[str, Any]:
     for key, value in values.items():
         if not key.horizon:
             nested[key.kind] = value
-        elif key.horizon in ahead:
+        elif key.horizon in ahead and key.kind != MEASURED_BEFORE:
             place = nested[key.kind].setdefault(key.of, {}) if key.of or key.kind == "measurement" else nested[key.kind]
             place[ahead[key.horizon]] = value
     return nested
@@ -185,37 +195,49 @@ def _errors_at(found: Proof, horizon: str, changed: Mapping[Key, Change | None])
 
 
 def _ruling(found: Proof, name: str, changed: Mapping[Key, Change | None]) -> tuple[Change | None, str]:
-    """The difference of log p(y) that counts, and by what: particles', where they see it otherwise or follow only one
-    of the two programs."""
+    """The difference of log p(y) that counts, and what is said of it: particles', where they see it otherwise; none,
+    where they do not follow both programs."""
     linear, by_particles = changed[Key("log_likelihood", "", 0)], changed.get(BY_PARTICLES)
     lost = [one for one in (found.reference, name) if isinstance(found.rows[one].neglected, str)]
     if lost:
         return None, f"no particle filter follows {' or '.join(lost)}, so that log p(y) says nothing"
-    asked = all(isinstance(found.rows[one].neglected, Tensor) for one in (found.reference, name))
-    if asked and by_particles is None:
-        return None, "by particles log p(y) is not finite"
-    if linear is None or by_particles is None or abs(by_particles.difference - linear.difference) <= MAX_DOUBT:
+    pair = [found.rows[one].sums for one in (name, found.reference)]
+    if linear is None or not all(BY_PARTICLES in sums for sums in pair):
         return linear, ""
-    said = with_interval(linear.difference, linear.interval, 1, "")
-    return by_particles, f"(by particles; linearised {said}, which is not to be believed) "
+    if by_particles is None:
+        return None, "by particles log p(y) is not finite"
+    ours, theirs = (_neglected(sums) for sums in pair)
+    apart = paired(ours, theirs, seed=found.seed)
+    is_apart = apart is not None and (apart.interval[0] > MAX_DOUBT or apart.interval[1] < -MAX_DOUBT)
+    if not is_apart and _sign([linear]) == _sign([by_particles]):
+        return linear, ""
+    return by_particles, f"by particles (linearised {linear.difference:+.1f}) ".replace("-", "−")
+
+
+def _neglected(sums: Mapping[Key, Sums]) -> Sums:
+    """What the linearised log p(y) of each drive leaves out."""
+    by_particles, linear = sums[BY_PARTICLES], sums[Key("log_likelihood", "", 0)]
+    return replace(linear, total=by_particles.total - linear.total)
 
 
 def _no_models(found: Proof, name: str) -> str:
-    """That programs predict worse than what knows nothing of the vehicle."""
+    """That programs predict worse, in every unit, than what knows nothing of the vehicle."""
     horizon, lost = _far(found), dict[str, str]()
     for one in (found.reference, name):
-        for simple, words in SIMPLE_ROWS.items():
-            if (
-                simple in found.rows
-                and _sign([*_errors_at(found, horizon, _differences(found, one, simple)).values()]) > 0
-            ):
-                lost[one] = words
-                break
+        for simple, (kind, words) in SIMPLE_ROWS.items():
+            if simple in found.rows and one not in lost:
+                differences = _differences(found, one, simple)
+                errors = [change for key, change in differences.items() if key[::2] == (kind, found.horizons[horizon])]
+                if errors and all(change is not None and change.interval[0] > 0 for change in errors):
+                    lost[one] = words
     if name not in lost:
         return ""
     if len(lost) == 1:
         return f"{name} is not yet a model: {horizon} ahead it errs more than {lost[name]}. "
-    return f"Neither {found.reference} nor {name} is yet a model: {horizon} ahead both err more than {lost[name]}. "
+    neither = f"Neither {found.reference} nor {name} is yet a model: {horizon} ahead"
+    if lost[name] == lost[found.reference]:
+        return f"{neither} both err more than {lost[name]}. "
+    return f"{neither} the one errs more than {lost[found.reference]}, the other more than {lost[name]}. "
 
 
 def _sign(found: Sequence[Change | None]) -> int:

@@ -38,9 +38,14 @@ Scales = dict[str, dict[str, float | None]]  # "channels" and "measurements" →
 class Key(NamedTuple):
     """Which figure."""
 
-    kind: str  # log_likelihood, log_likelihood_by_particles, coverage_90, measurement or state
+    kind: str  # log_likelihood, log_likelihood_by_particles, coverage_90, measurement, measured before or state
     of: str  # the unit of measurements, the error group of states
     horizon: int  # rows, 0 for log p(y)
+
+
+BY_PARTICLES = Key("log_likelihood_by_particles", "", 0)
+MEASURED_BEFORE = "measured before"  # errors of cells that a last measurement predicts as well
+Held = Mapping[int, tuple[Tensor, Tensor]]  # horizon → what `last_measurement` gives
 
 
 @dataclass(frozen=True)
@@ -203,17 +208,19 @@ def noise_floor(true: Judged, seed: int) -> Judged | str:
     return compare_predictions(own, ahead, true.horizons)
 
 
-def as_row(judged: Judged, counted: Mapping[int, Tensor]) -> ProgramScores:
-    """Sum over each drive the cells that count, `(T + 1 − horizon, B, K)` for each horizon."""
+def as_row(judged: Judged, counted: Mapping[int, Tensor], held: Held) -> ProgramScores:
+    """Sum over each drive the cells that count, `(T + 1 − horizon, B, K)` for each horizon, and beside them those that
+    were `held` before."""
     likely = judged.ahead.log_likelihood.numpy(force=True)
     sums = {Key("log_likelihood", "", 0): Sums(likely, np.ones_like(likely))}
     if isinstance(judged.neglected, Tensor):
         by_particles = likely + judged.neglected.numpy(force=True)
-        sums[Key("log_likelihood_by_particles", "", 0)] = Sums(by_particles, np.ones_like(likely))
+        sums[BY_PARTICLES] = Sums(by_particles, np.ones_like(likely))
     problem = judged.problem
     for horizon, ahead in judged.predictions.items():
         seen = counted[horizon]
-        sums |= _of_measurements(problem.program, horizon, ahead.error, seen)
+        sums |= _of_measurements(problem.program, "measurement", horizon, ahead.error, seen)
+        sums |= _of_measurements(problem.program, MEASURED_BEFORE, horizon, ahead.error, seen & held[horizon][1])
         if bool(torch.isfinite(ahead.variance[seen]).any()):
             sums[Key("coverage_90", "", horizon)] = _sums(ahead.covered(), seen)
     for (group, horizon), (squares, known) in judged.states.items():
@@ -222,20 +229,25 @@ def as_row(judged: Judged, counted: Mapping[int, Tensor]) -> ProgramScores:
     return ProgramScores(problem.program, sums, noise_scales(problem, judged.tracked), judged.neglected)
 
 
-def row_of_last_measurement(judged: Judged, counted: Mapping[int, Tensor]) -> ProgramScores:
+def held_measurements(judged: Judged) -> Held:
+    """See `last_measurement`, at the horizons of what is judged."""
+    return last_measurement(judged.problem.without_truth(), judged.tracked.smoothed, list(judged.predictions))
+
+
+def row_of_last_measurement(judged: Judged, counted: Mapping[int, Tensor], held: Held) -> ProgramScores:
     """The errors of a measurement that stays as it was, of the cells that count and have been measured before."""
-    problem, sums = judged.problem.without_truth(), dict[Key, Sums]()
-    held = last_measurement(problem, judged.tracked.smoothed, list(judged.predictions))
+    program, sums = judged.problem.program, dict[Key, Sums]()
     for horizon, (error, both) in held.items():
-        sums |= _of_measurements(problem.program, horizon, error, counted[horizon] & both)
-    return ProgramScores(problem.program, sums, {"channels": {}, "measurements": {}})
+        for kind in ("measurement", MEASURED_BEFORE):
+            sums |= _of_measurements(program, kind, horizon, error, counted[horizon] & both)
+    return ProgramScores(program, sums, {"channels": {}, "measurements": {}})
 
 
-def _of_measurements(program: Program, horizon: int, error: Tensor, seen: Tensor) -> dict[Key, Sums]:
+def _of_measurements(program: Program, kind: str, horizon: int, error: Tensor, seen: Tensor) -> dict[Key, Sums]:
     units, found = program.measurement_units, dict[Key, Sums]()
     for of in dict.fromkeys(units):
         chosen = [i for i, name in enumerate(units) if name == of]
-        found[Key("measurement", of, horizon)] = _sums(error[..., chosen].square(), seen[..., chosen], root=True)
+        found[Key(kind, of, horizon)] = _sums(error[..., chosen].square(), seen[..., chosen], root=True)
     return found
 
 

@@ -13,10 +13,9 @@ import numpy as np
 import torch
 
 from steady_ppl.criticism.perturbations import Direction
-from steady_ppl.criticism.residual_maps import CHECK_LEVEL, Array, standardise, tail_p_value
+from steady_ppl.criticism.residual_maps import CHECK_LEVEL, Array, standardise, tail_p_values
 
 FAULT_KINDS = ("sensor", "actuator", "dynamics")  # of directions
-LEVEL_OF_TEST = CHECK_LEVEL / 4  # of mean, parameters, noise and maps, which together keep the level (Bonferroni)
 MIN_GAIN_OF_KIND = 3.0  # nats of log p(y) between the best kind and the next
 SCATTER = "scatter of "  # begins the names of mean squares
 MAX_DIRECTIONS = 4  # of a kind, that are picked one after the other
@@ -30,8 +29,9 @@ class Attribution:
     """What the scores say."""
 
     kind: str  # "sensor", "actuator", "dynamics", "parameters", "noise", "cannot tell" or "nothing found"
-    p_value: float  # of the hypothesis that the program is right, all tests together (Bonferroni)
+    p_value: float  # of the hypothesis that the program is right, all tests together
     p_values: dict[str, float]  # of "mean", "parameters", "noise" and "maps": that nothing is wrong with them
+    level: float  # of each of these, with which all together keep the level of a check
     explained: dict[str, float]  # nats that the best directions of each kind explain
     evidence: list[tuple[str, str, float]]  # the directions picked, best first: (kind, name, z)
     parameters: dict[str, float]  # z of each parameter's score
@@ -49,10 +49,11 @@ class Scored:
     correlation: Array  # (J, J)
     dispersion: Array  # (1 + M, J): how much more than simulated drives the drives of a set differ
 
-    def p_value(self, widest: Array) -> float:
-        """Of the hypothesis that no direction is wrong; wrong noise scatters scores no wider than `widest`."""
+    def p_values(self, widest: Array) -> Array:
+        """Of the hypothesis that no direction of a set is wrong, `(1 + M,)`; wrong noise scatters scores no wider than
+        `widest`."""
         z = self.z / np.sqrt(np.minimum(self.dispersion, widest).clip(1.0))
-        return tail_p_value(np.abs(z).max(-1)) if self.names else 1.0
+        return tail_p_values(np.abs(z).max(-1)) if self.names else np.ones(len(z))
 
     def explaining(self, kind: str, widened: float) -> tuple[list[int], float]:
         """Some directions of a kind, picked one after the other, and the nats that they explain, less their price."""
@@ -150,18 +151,30 @@ def _dispersion(each: Array, correlation: Array) -> Array:
     return (squares / np.maximum(squares[1:].mean(0), 1e-300)) @ weight / np.maximum(weight.sum(0), 1e-300)
 
 
-def attribute(scores: Scored, parameters: Scored, noise: dict[str, Array], maps_p_value: float) -> Attribution:
-    """Decide who is at fault by the two of `scored`, by mean squares and the like, of the real and every simulated set
-    `(1 + M,)`, and by the p-value of the hypothesis that the maps hold nothing."""
+def _together(each: Array) -> tuple[float, float]:
+    """The p-value of several tests together, of their p-values `(tests, 1 + M)`, and the level of each with which all
+    keep that of a check: as many independent tests as the simulated sets' smallest p-values are like (Šidák)."""
+    smallest = each.min(0)
+    median = float(np.median(smallest[1:]).clip(1e-6, 0.5))
+    effective = min(max(1.0, math.log(0.5) / math.log1p(-median)), len(each))
+    together = -math.expm1(effective * math.log1p(-min(float(smallest[0]), 1 - 1e-12)))
+    return together, -math.expm1(math.log1p(-CHECK_LEVEL) / effective)
+
+
+def attribute(scores: Scored, parameters: Scored, noise: dict[str, Array], maps: Array) -> Attribution:
+    """Decide who is at fault by the two of `scored`, by mean squares and the like, and by the p-values of the
+    hypothesis that the maps hold nothing, each of the real and every simulated set `(1 + M,)`."""
     scatter = np.stack([values / values[1:].mean() for name, values in noise.items() if name.startswith(SCATTER)])
     widest = scatter.max(0)[:, None]  # wrong noise scatters no score wider
     squares, _ = standardise(np.stack(list(noise.values()), -1))
-    p_values = {
-        "mean": scores.p_value(widest),
-        "parameters": parameters.p_value(widest),
-        "noise": tail_p_value(np.abs(squares).max(-1)),
-        "maps": maps_p_value,
+    each = {
+        "mean": scores.p_values(widest),
+        "parameters": parameters.p_values(widest),
+        "noise": tail_p_values(np.abs(squares).max(-1)),
+        "maps": maps,
     }
+    together, level = _together(np.stack([*each.values()]))
+    p_values = {what: float(values[0]) for what, values in each.items()}
     dispersion = float(scores.dispersion[0].mean())
     widened = math.sqrt(min(max(1.0, dispersion), float(widest[0, 0])))
     by_kind = {kind: scores.explaining(kind, widened) for kind in FAULT_KINDS if kind in scores.kinds}
@@ -169,7 +182,7 @@ def attribute(scores: Scored, parameters: Scored, noise: dict[str, Array], maps_
     best = max(explained, key=lambda kind: explained[kind])
     others = [nats for kind, nats in explained.items() if kind != best]
     _, of_own = parameters.explaining("parameter", widened)
-    wrong = {what for what, p_value in p_values.items() if p_value <= LEVEL_OF_TEST}
+    wrong = {what for what, p_value in p_values.items() if p_value <= level}
     if "parameters" in wrong and ("mean" not in wrong or of_own > explained[best]):
         kind = "parameters"
     elif "mean" in wrong:
@@ -181,8 +194,9 @@ def attribute(scores: Scored, parameters: Scored, noise: dict[str, Array], maps_
         kind = "cannot tell" if "maps" in wrong else "nothing found"
     return Attribution(
         kind=kind,
-        p_value=min(1.0, len(p_values) * min(p_values.values())),
+        p_value=together,
         p_values=p_values,
+        level=level,
         explained=explained,
         evidence=[(scores.kinds[j], scores.names[j], float(scores.z[0, j])) for j in by_kind[best][0]],
         parameters=dict(zip(parameters.names, parameters.z[0].tolist(), strict=True)),

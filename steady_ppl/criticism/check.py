@@ -6,29 +6,31 @@ program makes of the same controls, so that every figure has a band.
 
 import itertools
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from steady_ppl.criticism.attribution import SCATTER, attribute, scored
 from steady_ppl.criticism.baselines import constant_velocity, last_measurement
 from steady_ppl.criticism.perturbations import directions
-from steady_ppl.criticism.reference_sets import MIN_BAND_SETS, residuals, simulate_sets
+from steady_ppl.criticism.reference_sets import MIN_BAND_SETS, SimulatedSets, residuals, simulate_sets
 from steady_ppl.criticism.residual_maps import Residuals, misfit_of
 from steady_ppl.criticism.result import Check
 from steady_ppl.criticism.step_size import check_step
 from steady_ppl.data.frozen_sensors import frozen_stretches
-from steady_ppl.data.horizons import named_horizons
 from steady_ppl.data.table import refuse_long
 from steady_ppl.data.trajectories import Trajectories
-from steady_ppl.errors import DataError, UsageError
+from steady_ppl.errors import DataError, FilterError, UsageError
 from steady_ppl.gaussian.kalman import track
 from steady_ppl.gaussian.linearize import require_linear
-from steady_ppl.gaussian.predict import predict
+from steady_ppl.gaussian.predict import predict, suited_horizons
 from steady_ppl.gaussian.smoother import find_and_smooth
 from steady_ppl.kernels.rows import fallback_notes, kernel_failures
+from steady_ppl.likelihood.information import ParameterInformation
 from steady_ppl.likelihood.outliers import find_outliers
 from steady_ppl.likelihood.parameter_posterior import undetermined
 from steady_ppl.model.problem import Problem
@@ -40,13 +42,24 @@ from steady_ppl.utils.progress import stages
 from steady_ppl.utils.random import seeded
 
 CHECK_HORIZONS = 2  # times ahead, besides one step
+MAX_ROWS_OF_DRAWS = 60_000  # rows times draws of the parameters, each of which is simulated by itself
+BANDS_HOLD = (
+    "these drives are not those of the fit: bands hold what its own drives leave open of its parameters as well"
+)
+BANDS_HOLD_NOT = "parameters are taken as exact: within what the fit's drives leave open of them the program blows up"
 MAX_RESIDUAL_SD = 4.0  # of a single residual; beside a landmark the linearised program knows no more
 
 
 @one_thread()
 @torch.no_grad()
 def check(
-    fit: Fit, data: Trajectories, *, simulations: int = 100, horizons: Sequence[float] = (), seed: int = 0
+    fit: Fit,
+    data: Trajectories,
+    *,
+    simulations: int = 100,
+    horizons: Sequence[float] = (),
+    has_seen: bool | None = None,
+    seed: int = 0,
 ) -> Check:
     """Compare a fitted program with measurements.
 
@@ -56,6 +69,8 @@ def check(
         data: drives, best those that were not used for the fit.
         simulations: sets of drives to simulate for the bands.
         horizons: seconds ahead, besides one step; those that suit the drives where none is given, see `data.horizons`.
+        has_seen: whether the fit is of these drives, so that its parameters' uncertainty does not count; None: if it
+            is of drives on which the same was measured.
         seed: of the simulation.
 
     Raises:
@@ -76,9 +91,9 @@ def check(
         raise DataError("nothing to compare: no trajectory has a measurement after its first row")
     refuse_long(run)
     require_linear(problem, "check needs a program that can be linearised")
-    ahead_by = named_horizons(run, CHECK_HORIZONS, horizons)
     known = fit.information if fit.information is not None and fit.information.suits(program) else None
-    unseen = known is not None and not known.has_seen(run)
+    if has_seen is None:
+        has_seen = known is not None and known.has_seen(run)
     parts = (("finding paths", 1), ("comparing time steps", 1), ("simulating drives", 2), ("judging", 2))
     with stages(*parts) as begin:
         begin()
@@ -90,6 +105,7 @@ def check(
                 problem = replace(problem, data=run)
                 ahead = find_and_smooth(problem)
             path = ahead.linearization.path
+            ahead_by = suited_horizons(program, run, CHECK_HORIZONS, horizons)
             real = track(problem, path, passes=1)
             _, drawn, _ = ahead.draws(simulations)
             starts = run.known_start.expand(simulations, -1, -1) if fit.known_start else drawn[:, 0]
@@ -97,8 +113,7 @@ def check(
             step = check_step(program, run, path, known_start=fit.known_start)
             begin()
             rows = list(ahead_by.values())
-            values = known.draws(program, simulations) if known is not None and unseen else None
-            made = simulate_sets(problem, starts, real.noise.shape[-1], rows, values)
+            made, is_open = _reference_sets(problem, starts, real.noise.shape[-1], rows, None if has_seen else known)
         begin()
         predictions = predict(program, run, real, rows)
         ours = replace(residuals(program, run, real, predictions[1], 1), raw=predictions[1].error.numpy(force=True))
@@ -110,6 +125,10 @@ def check(
         both = Residuals.concatenated([ours, theirs])
         misfit = misfit_of(both, time, controls, _pairs(program, ours), dispersion)
     notes = [] if made.sets == simulations else [f"{simulations - made.sets} of {simulations} simulated sets blew up"]
+    if known is not None and not has_seen:
+        seen = len(known.drives.intersection(problem.data.digests))
+        notes.append(BANDS_HOLD if is_open else BANDS_HOLD_NOT)
+        notes += [f"{seen} of these drives are the fit's own, and count as others here"] if seen else []
     notes += fallback_notes(uncompiled) + run.uneven_steps + diagnose_units(program, run)
     notes += [outliers.note] if outliers.note else []
     notes += [f"refitted to these drives, {step.note}"] if step.note else []
@@ -129,15 +148,27 @@ def check(
         held=last_measurement(problem, real.smoothed, rows),
         step=step,
         misfit=misfit,
-        blame=attribute(scores, parameters, _scatter(both), misfit.p_value),
+        blame=attribute(scores, parameters, _scatter(both), misfit.p_values),
         residuals=list(ours.names),
         standardised=ours,
         stuck=frozen_stretches(data),
         outliers=outliers,
-        fitted=known,
-        unseen=unseen,
+        information=known,
+        is_open=is_open,
         notes=notes,
     )
+
+
+def _reference_sets(
+    problem: Problem, starts: Tensor, channels: int, rows: Sequence[int], known: ParameterInformation | None
+) -> tuple[SimulatedSets, bool]:
+    """Sets under draws of the parameters, where that much is `known`, or else as they are; and whether by draws."""
+    if known is not None:
+        draws = min(len(starts), max(MIN_BAND_SETS, MAX_ROWS_OF_DRAWS // problem.data.time.shape[0]))
+        values = known.draws(problem.program, draws).repeat_interleave(-(-len(starts) // draws), 0)[: len(starts)]
+        with suppress(FilterError):  # numbers that the fit's drives hardly tell lead anywhere
+            return simulate_sets(problem, starts, channels, rows, values), True
+    return simulate_sets(problem, starts, channels, rows), False
 
 
 def _in_own_spreads(real: Residuals, simulated: Residuals) -> tuple[Residuals, Residuals]:

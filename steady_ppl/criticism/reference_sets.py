@@ -6,7 +6,7 @@ drives': three hundred drives and a hundred sets at once would take fourteen gig
 
 import copy
 import itertools
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -94,7 +94,11 @@ def _block(problem: Problem, starts: Tensor, values: Tensor | None, channels: in
     """What `SimulatedSets` has of some sets, each tensor with the sets or their drives in front, and the names in it;
     nothing where every set blew up."""
     program, sets = problem.program, len(starts)
-    programs, begins = ([program], [starts]) if values is None else (_moved(program, values), starts.split(1))
+    programs: Iterable[Program] = [program]
+    begins: Sequence[Tensor] = [starts]
+    if values is not None:
+        values, counts = values.unique_consecutive(dim=0, return_counts=True)
+        programs, begins = _moved(program, values), starts.split(counts.tolist())
     again, truth = simulate_each(programs, problem.data, begins, channels)
     copies = replace(problem, data=again)
     near, tracked = _tracked(copies, truth)

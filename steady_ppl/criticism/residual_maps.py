@@ -99,9 +99,14 @@ class Misfit:
     cells: list[Cell]
     z: Array  # one a cell
     significant: list[SignificantCell]  # at a false-discovery rate of 5 %, strongest first
-    p_value: float  # of the hypothesis that there is nothing, by Simes' test, calibrated on the simulated sets
-    simulated: Array  # the same of each simulated set, (M,)
+    p_values: Array  # (1 + M,): of the hypothesis that a set has nothing, by Simes' test, calibrated on the simulated
+    simulated: Array  # Simes' own p-value of each simulated set, (M,)
     dispersion: Array  # mean square of each residual over that of the simulated ones, (R,); NaN where there are none
+
+    @property
+    def p_value(self) -> float:
+        """Of the real set."""
+        return float(self.p_values[0])
 
     def of_map(self, name: str) -> list[tuple[Cell, float]]:
         """The cells of one map, each with its z."""
@@ -143,7 +148,7 @@ def misfit_of(
         cells=cells,
         z=z[0],
         significant=sorted(findings, key=lambda finding: -abs(finding.z)),
-        p_value=max(float(simes[0]), tail_p_value(-np.log(np.maximum(simes, 1e-300)))),
+        p_values=np.maximum(simes, tail_p_values(-np.log(np.maximum(simes, 1e-300)))),
         simulated=simes[1:],
         dispersion=dispersion[0],
     )
@@ -163,10 +168,12 @@ def standardise(values: Array) -> tuple[Array, int]:
     return np.nan_to_num(z), len(simulated) - 1
 
 
-def tail_p_value(values: Array) -> float:
-    """How often a maximum is as large as the first value, by Gumbel's distribution with the moments of the others."""
+def tail_p_values(values: Array) -> Array:
+    """How often a maximum is as large as each value `(1 + M,)`: Gumbel's distribution with the moments of all but the
+    first."""
     scale = max(float(values[1:].std(ddof=1)), 1e-12) * math.sqrt(6) / math.pi
-    return -math.expm1(-math.exp(min(-(float(values[0] - values[1:].mean()) / scale) - np.euler_gamma, 700.0)))
+    away = (values - values[1:].mean()) / scale
+    return -np.expm1(-np.exp(np.minimum(-away - np.euler_gamma, 700.0)))
 
 
 def _adjusted(p_values: Array) -> Array:

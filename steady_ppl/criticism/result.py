@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from steady_ppl.criticism.attribution import LEVEL_OF_TEST, MIN_GAIN_OF_KIND, Attribution
+from steady_ppl.criticism.attribution import MIN_GAIN_OF_KIND, Attribution
 from steady_ppl.criticism.baselines import DEFINITION, Reference
 from steady_ppl.criticism.residual_maps import Cell, Misfit, Residuals, SignificantCell
 from steady_ppl.criticism.step_size import StepCheck
@@ -44,7 +44,7 @@ class Check(Displayed):
         path: near their posterior means.
         horizons: name → how many rows ahead, "one step" first.
         predictions: horizon → measured less predicted.
-        floor: horizon → RMSE of each component in each simulated set, `(M, K)`: what the noise alone would leave.
+        floor: horizon → RMSE of each component in each simulated set, `(M, K)`, see `floor_name`.
         reference: the vehicle that keeps its velocity, or why there is none.
         held: horizon → measured less last measured, and where both exist.
         step: the program beside itself at finer steps, refitted to these drives.
@@ -54,8 +54,8 @@ class Check(Displayed):
         standardised: the residuals themselves, one set, with the variables that the regimes are ranges of.
         stuck: stretches of the table in which nothing was measured though something is written.
         outliers: readings that no noise of the sensors explains; nothing else is about them.
-        fitted: how well the drives of its fit determine the program's parameters; None where nobody said.
-        unseen: whether the parameters' uncertainty counts, for it was not fitted to these drives.
+        information: how well the drives of its fit determine the program's parameters; None where nobody said.
+        is_open: whether bands hold what these leave open, for it was not fitted to the drives that are checked.
         notes: what was left out.
     """
 
@@ -74,8 +74,8 @@ class Check(Displayed):
     standardised: Residuals
     stuck: list[Stretch]
     outliers: Outliers
-    fitted: ParameterInformation | None
-    unseen: bool
+    information: ParameterInformation | None
+    is_open: bool
     notes: list[str]
 
     @property
@@ -93,8 +93,8 @@ class Check(Displayed):
             "program": type(self.program).__name__,
             "trajectories": len(self.data),
             "simulations": len(misfit.simulated),
-            "parameter_uncertainty": self.unseen,
-            "gain_of_longer_fit": self.fitted.gain if self.fitted else None,
+            "parameter_uncertainty": self.is_open,
+            "gain_of_longer_fit": self.information.gain if self.information else None,
             "measurements": {name: _component(self, i) for i, name in enumerate(self.program.measurement_names)},
             "constant_velocity": about | {"loses_to_it": lost_horizons(self)},
             "findings": [
@@ -123,7 +123,7 @@ class Check(Displayed):
 
     def __str__(self) -> str:
         content = self.figures
-        table = [["", "ahead", "RMSE", "noise alone", "constant velocity", "last measurement", "in 90 % band"]]
+        table = [["", "ahead", "RMSE", floor_name(self), "constant velocity", "last measurement", "in 90 % band"]]
         for name, component in content["measurements"].items():
             for horizon, row in component["horizons"].items():
                 keys = ("rmse", "noise_floor", "constant_velocity", "last_measurement")
@@ -165,6 +165,11 @@ def _component(found: Check, index: int) -> dict[str, Any]:
             "count": count,
         }
     return {"unit": found.program.measurement_units[index], "horizons": horizons}
+
+
+def floor_name(found: Check) -> str:
+    """What the errors of simulated sets are from."""
+    return "noise and fit" if found.is_open else "noise alone"
 
 
 def _rms(error: Tensor, there: Tensor) -> float | None:
@@ -242,11 +247,11 @@ def verdict(found: Check) -> str:
         said += "; `steady discover` says what could not have been seen"
     else:
         said = "The program does not explain these drives: "
-        if blame.p_values["parameters"] <= LEVEL_OF_TEST:
+        if blame.p_values["parameters"] <= blame.level:
             (fault, _), (_, beside) = VERDICTS["parameters"], VERDICTS[blame.kind]
-            said += f"{fault}{_parameters(blame)}{_of_fit(found.fitted)}"
+            said += f"{fault}{_parameters(blame)}{_of_fit(found.information)}"
             said += f"; beside them {beside}{_most_clearly(blame)}" if beside else ""
-            said += f"; {discover}" if _is_done(found.fitted) else f"; if that changes little, {discover}"
+            said += f"; {discover}" if _is_done(found.information) else f"; if that changes little, {discover}"
         else:
             of_noise = "the effects of kind noise in `steady discover` say in which way"
             next_command = of_noise if blame.kind == "noise" else discover
@@ -267,8 +272,8 @@ def _of_fit(fitted: ParameterInformation | None) -> str:
     if fitted is None:
         return f": {again}"
     if _is_done(fitted):
-        return ", though on its own drives its fit has ended: what it lacks is no number of it"
-    return f", and its fit had not ended (a longer one gains {fitted.gain:.2g} nats): {again}"
+        return ", though its fit has ended: either these drives are of another vehicle, or it lacks what is no number"
+    return f", and its fit had not ended (a longer one gains {fitted.gain:.2g} nats, linearised): {again}"
 
 
 def _most_clearly(blame: Attribution) -> str:

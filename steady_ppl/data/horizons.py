@@ -19,40 +19,50 @@ SHARE_MOVED = 0.3  # of what measurements far apart differ by, mean square, abov
 LAG_RATIO = 1.15  # of one lag that is looked at to the one before
 MAX_SHARE_OF_DRIVE = 0.5  # that a lag may have: longer ones join few pairs of rows
 MIN_PAIRS = 20  # of measurements a lag
+MAX_SHARE_OF_NOISE = 0.95  # of a column that tells: what is left is too little
 
 
-def named_horizons(data: Trajectories, count: int, seconds: Sequence[float] = ()) -> dict[str, int]:
+def named_horizons(
+    data: Trajectories, count: int, seconds: Sequence[float] = (), circle: Tensor | None = None
+) -> dict[str, int]:
     """Name → rows ahead: one step, and those times that fit into the longest drive.
 
     Args:
         data: the drives.
         count: how many times there are at most, from the time scale on, in the series 1, 3, 10, 30, …
         seconds: times that are asked for instead.
+        circle: which measurements do not notice a whole turn, `(K,)` bool.
+
+    Raises:
+        UsageError: a time that is asked for is less than two rows, longer than all drives, or the same rows as another.
     """
-    for one in seconds:
+    if not seconds:
+        first = round(2 * math.log10(time_scale(data, circle)))
+        rows = {f"{one:g} s": data.rows_ahead(one) for one in map(_in_series, range(first, first + count))}
+        return {"one step": 1} | {name: ahead for name, ahead in rows.items() if 1 < ahead < data.time.shape[0]}
+    found = {"one step": 1}
+    for one in sorted(set(seconds)):
         require(math.isfinite(one) and one > 0, "horizons", one, "seconds above zero")
-    times = sorted(set(seconds))
-    if not times:
-        first = round(2 * math.log10(time_scale(data)))
-        times = [_in_series(place) for place in range(first, first + count)]
-    rows = {f"{one:g} s": data.rows_ahead(one) for one in times}
-    return {"one step": 1} | {name: ahead for name, ahead in rows.items() if 1 < ahead < data.time.shape[0]}
+        ahead, longest = data.rows_ahead(one), (data.time.shape[0] - 1) * data.median_step
+        require(1 < ahead < data.time.shape[0], "horizons", one, f"{2 * data.median_step:.3g} to {longest:.3g} s")
+        require(ahead not in found.values(), "horizons", one, "times that are not the same number of rows")
+        found[f"{one:g} s"] = ahead
+    return found
 
 
-def time_scale(data: Trajectories) -> float:
-    """Seconds in which what is measured moves by much of its range, 1 or 3 times a power of ten.
+def time_scale(data: Trajectories, circle: Tensor | None = None) -> float:
+    """Seconds in which what is measured moves by much of its range, 1 or 3 times a power of ten, no less than a row.
 
-    Never less than a row; where the drives are too short to tell, a tenth of the longest.
+    The middle of the measurements; a tenth of the longest drive where none tells. `circle` is that of `named_horizons`.
     """
-    step, rows = data.median_step, data.time.shape[0]
-    lags = [1]
-    while (further := max(lags[-1] + 1, round(lags[-1] * LAG_RATIO))) <= MAX_SHARE_OF_DRIVE * rows:
-        lags.append(further)
-    moved = _share_moved(data, lags)
-    known = moved.isfinite().nonzero().flatten()
-    far = (moved - moved[known[:1]] >= SHARE_MOVED).nonzero().flatten() if len(known) else known
-    seconds = step * (lags[int(far[0])] if len(far) else max(1.0, 0.1 * rows))
-    return _in_series(round(2 * math.log10(seconds)))
+    step, values = data.median_step, data.measurements.to(torch.complex128)
+    if circle is not None:
+        values = torch.where(circle, torch.polar(torch.ones_like(values.real), values.real), values)
+    found = [_rows_of_move(*column) for column in zip(values.unbind(-1), data.observed.unbind(-1), strict=True)]
+    told = sorted(rows for rows in found if rows is not None)
+    seconds = step * (told[(len(told) - 1) // 2] if told else max(1.0, 0.1 * data.time.shape[0]))
+    place = round(2 * math.log10(seconds))
+    return _in_series(place if _in_series(place) >= step * (1 - 1e-6) else place + 1)
 
 
 def _in_series(place: int) -> float:
@@ -60,27 +70,32 @@ def _in_series(place: int) -> float:
     return float(f"{'3' if place % 2 else '1'}e{place // 2}")
 
 
-def _share_moved(data: Trajectories, lags: Sequence[int]) -> Tensor:
-    """By what measurements so many rows apart differ, of that by which any two of a drive do, mean squares, the mean
-    over the columns, `(lags,)`; NaN where too few pairs were measured."""
-    seen, found = data.observed, []
-    values = torch.where(seen, _on_a_circle(data.measurements.double(), seen), 0.0)
+def _rows_of_move(values: Tensor, seen: Tensor) -> int | None:
+    """Rows in which a column `(T + 1, B)` moves by `SHARE_MOVED`; None where it is noise alone or too few are there.
+
+    The noise is what the first two lags extrapolate to, if they rise as what moves smoothly does.
+    """
     count = seen.sum(0)
-    apart = torch.where(seen, (values - values.sum(0) / count.clamp(min=1)).abs().square(), 0.0).sum((0, 1))
-    variance = apart / (count - 1).clamp(min=0).sum(0).clamp(min=1)
-    for lag in lags:
+    mean = torch.where(seen, values, 0.0).sum(0) / count.clamp(min=1)
+    apart = torch.where(seen, (values - mean).abs().square(), 0.0)
+    variance = float(apart.sum()) / max(1, int((count - 1).clamp(min=0).sum()))
+    most = int(MAX_SHARE_OF_DRIVE * len(values))
+    first = next((lag for lag in range(1, most + 1) if int((seen[lag:] & seen[:-lag]).sum()) >= MIN_PAIRS), 0)
+    if not first or not variance > 0:
+        return None
+
+    def share(lag: int) -> float:
         both = seen[lag:] & seen[:-lag]
-        squares = torch.where(both, (values[lag:] - values[:-lag]).abs().square(), 0.0).sum((0, 1))
-        pairs = both.sum((0, 1))
-        share = squares / pairs.clamp(min=1) / (2 * variance)
-        found.append(torch.where((pairs >= MIN_PAIRS) & (variance > 0), share, torch.nan).nanmean())
-    return torch.stack(found)
+        squares = torch.where(both, (values[lag:] - values[:-lag]).abs().square(), 0.0).sum()
+        return float(squares) / max(1, int(both.sum())) / (2 * variance)
 
-
-def _on_a_circle(values: Tensor, seen: Tensor) -> Tensor:
-    """Measurements as complex numbers; those of a column within a turn, some of them across it from the row before,
-    on the circle."""
-    jumps = ((values[1:] - values[:-1]).abs() > math.pi) & seen[1:] & seen[:-1]
-    within = (torch.where(seen, values, 0.0).abs() <= 2 * math.pi).all(0).all(0)
-    turns = within & jumps.any(0).any(0)
-    return torch.where(turns, torch.polar(torch.ones_like(values), values), values.to(torch.complex128))
+    multiples, lags = [1], [first]
+    while (lag := first * max(multiples[-1] + 1, round(multiples[-1] * LAG_RATIO))) <= most:
+        multiples.append(lag // first)
+        lags.append(lag)
+    shares = [share(lag) for lag in lags]
+    rise = (shares[1] - shares[0]) / 3 if len(shares) > 1 else 0.0  # of squares of one and two lags
+    noise = min(max(0.0, shares[0] - max(0.0, rise)), shares[0])
+    if noise > MAX_SHARE_OF_NOISE:
+        return None
+    return next((lag for lag, one in zip(lags, shares, strict=True) if one - noise >= SHARE_MOVED * (1 - noise)), None)

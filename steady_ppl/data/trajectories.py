@@ -69,10 +69,9 @@ class Trajectories(Displayed):
         """A hash of what was measured on each trajectory and under which controls, the same in any table."""
         found = []
         for index, length in enumerate(self.lengths.tolist()):
-            parts = [values[:length, index] for values in (self.measurements, self.observed)]
-            content = b"".join(
-                part.numpy(force=True).tobytes() for part in [self.controls[: length - 1, index], *parts]
-            )
+            acting = self.controls[: length - 1, index].float()
+            parts = [acting, self.measurements[:length, index].float(), self.observed[:length, index]]
+            content = b"".join(part.numpy(force=True).tobytes() for part in parts)
             found.append(hashlib.sha256(content).hexdigest()[:DIGITS_OF_DIGEST])
         return tuple(found)
 

@@ -8,14 +8,16 @@ from functools import partial
 import torch
 from torch import Tensor
 
+from steady_ppl.data.horizons import named_horizons
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.gaussian.kalman import Tracked
 from steady_ppl.gaussian.linearize import ReferencePath
 from steady_ppl.kernels.rows import function_of_rows, on_all_rows
-from steady_ppl.model.handlers import Observing, Recording, joined, residual, running
+from steady_ppl.model.handlers import Observing, Recording, draw_starts, joined, residual, running
 from steady_ppl.model.program import Program
 from steady_ppl.model.substeps import RowInputs, mean_step, noisy_step, row_inputs
 from steady_ppl.smc.simulate import measure
+from steady_ppl.utils.random import seeded
 
 HALF_WIDTH = 1.6448536269514729  # of a normal's 90 % interval, in standard deviations
 
@@ -142,3 +144,10 @@ def on_a_circle(program: Program, data: Trajectories, states: Tensor) -> Tensor:
     measured = torch.full_like(data.measurements[:1, :1], 0.3)
     change = errors(program, one, measured + 2 * math.pi, every) - errors(program, one, measured, every)
     return (change.abs() < 1e-3).flatten()
+
+
+def suited_horizons(program: Program, data: Trajectories, count: int, seconds: Sequence[float]) -> dict[str, int]:
+    """See `named_horizons`; the program knows which measurements do not notice a whole turn."""
+    with seeded(0, "horizons"):
+        start = draw_starts(program, 1, 1)
+    return named_horizons(data, count, seconds, on_a_circle(program, data, start))

@@ -164,25 +164,28 @@ def function_of_rows(
         arguments: its arguments in order, each `(rows, B)` or `(rows, B, ·)`, as they may be given to it.
     """
     first = next(iter(arguments.values()))
-    if _why_no_kernel(first) is not None:
+    if why := _why_no_kernel(first, least=1):
+        _noted(name, why)
         return function
     compiled_as, method = _method(program, f"{name} on all rows", function, arguments)
     if isinstance(method, str):
+        _noted(name, method)
         return function
-    constants = method.parameters(program)
+    constants, rows = method.parameters(program), -(-SIMD_LANES // first.shape[:2].numel())
 
     def by_kernel(*values: Tensor) -> Tensor:
-        return _called(method, constants, values)
+        found = _called(method, constants, (torch.cat([value] * rows) if rows > 1 else value for value in values))
+        return found[: len(values[0]), :, : method.values]
 
     if _differs(program, compiled_as, function, arguments, by_kernel(*arguments.values())):
-        discard(program, compiled_as)
+        _noted(name, discard(program, compiled_as))
         return function
     return by_kernel
 
 
-def _why_no_kernel(first: Tensor) -> str | None:
-    if first.shape[:2].numel() < SIMD_LANES:
-        return f"fewer than {SIMD_LANES} rows"
+def _why_no_kernel(first: Tensor, least: int = SIMD_LANES) -> str | None:
+    if first.shape[:2].numel() < least:
+        return f"fewer than {least} rows"
     if first.device.type != "cpu" or first.dtype != torch.float32:
         return f"{str(first.dtype).removeprefix('torch.')} on {first.device.type}"
     return None

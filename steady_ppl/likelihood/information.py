@@ -7,29 +7,33 @@ by how much.
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from steady_ppl.data.trajectories import Trajectories
-from steady_ppl.errors import FilterError, UsageError
+from steady_ppl.errors import UsageError
 from steady_ppl.gaussian.linearize import ReferencePath, why_not_linear
 from steady_ppl.gaussian.smoother import find_and_smooth
 from steady_ppl.likelihood.objective import (
-    MAX_MOVE,
     OBSERVED_SHARES,
     LinearizedObjective,
     Term,
     by_cross_products,
     linearised,
     observed,
+    reach,
 )
-from steady_ppl.likelihood.parameters import MAX_LEARNABLE_NUMBERS, elements, values_of
+from steady_ppl.likelihood.parameters import MAX_LEARNABLE_NUMBERS, Element, elements, values_of
 from steady_ppl.model.problem import Problem
 from steady_ppl.model.program import Program
+from steady_ppl.utils.cores import one_thread
+from steady_ppl.utils.text import reason_of
 
+NOT_KNOWN = "how well the drives determine the parameters is not known: {}"
 MAX_OBSERVATIONS = 6  # times that the curvature is observed, each with the sizes of the one before
 
 
@@ -51,10 +55,13 @@ class ParameterInformation:
     def from_tensors(cls, tensors: Mapping[str, Tensor], text: Mapping[str, str]) -> ParameterInformation:
         """Of what `as_tensors` returns; KeyError, ValueError or TypeError where it is something else."""
         names, gain, drives = (json.loads(text[name]) for name in ("names", "gain", "drives"))
-        matrix = tensors["matrix"].double()
-        if matrix.shape != (len(names), len(names)) or not bool(torch.isfinite(matrix).all()):
+        matrix, gain = tensors["matrix"].double(), float(gain)
+        if not (isinstance(names, list) and isinstance(drives, list) and math.isfinite(gain) and gain >= 0):
+            raise ValueError("it is no information of parameters")
+        symmetric = matrix.shape == (len(names), len(names)) and torch.allclose(matrix, matrix.T, equal_nan=False)
+        if not symmetric or not bool(torch.isfinite(matrix).all()):
             raise ValueError("its matrix does not suit its numbers")
-        return cls(tuple(map(str, names)), matrix, float(gain), frozenset(map(str, drives)))
+        return cls(tuple(map(str, names)), matrix, gain, frozenset(map(str, drives)))
 
     def has_seen(self, data: Trajectories) -> bool:
         """Whether the program was fitted to each of these drives, as it reads them."""
@@ -73,12 +80,12 @@ class ParameterInformation:
         What the drives do not tell is open by as much as a fit moves it at once.
         """
         parts = elements(program)
-        reach = torch.tensor([MAX_MOVE * part.step for part in parts], dtype=torch.float64)
-        curvature, turn = torch.linalg.eigh(reach * self.matrix * reach[:, None])
-        root = reach[:, None] * turn * curvature.clamp(min=1.0).rsqrt()
+        limits, turn, curvature = within_reach(parts, self.matrix)
+        root = limits[:, None] * turn * curvature.rsqrt()
         return values_of(parts) + torch.randn(count, len(parts), dtype=torch.float64) @ root.T
 
 
+@one_thread()
 @torch.no_grad()
 def information_of_fit(
     problem: Problem, path: ReferencePath | None = None, known: Tensor | None = None
@@ -96,35 +103,61 @@ def information_of_fit(
     count = sum(value.numel() for value in problem.program.parameters() if value.requires_grad)
     if not 0 < count <= MAX_LEARNABLE_NUMBERS:
         return None, []
+    if problem.data.time.is_cuda:
+        return None, [NOT_KNOWN.format("it is looked at on the CPU alone")]
     if why_not_linear(problem.program, problem.data, known_start=problem.known_start):
         return None, []
     try:
         near = path or find_and_smooth(problem).linearization.path
         here = linearised([Term.alone(problem, near)])
+        parts = here.terms[0].term.parts
         matrix = _observed(here, by_cross_products(here) if known is None else known)
-    except FilterError as error:
-        return None, [f"how well the drives determine the parameters is not known: {error}"]
-    if matrix is None:
-        return None, ["how well the drives determine the parameters is not known: the program diverges beside them"]
-    gain = 0.5 * float(here.gradient @ torch.linalg.solve(matrix, here.gradient))
-    names = tuple(part.name for part in here.terms[0].term.parts)
-    return ParameterInformation(names, matrix, gain, frozenset(problem.data.digests)), []
+        limits, turn, curvature = within_reach(parts, matrix)
+        gain = 0.5 * float(((turn.T @ (limits * here.gradient)).square() / curvature).sum())
+    except Exception as error:  # also of the program's own code, at numbers that nobody tried before; the fit stays
+        return None, [NOT_KNOWN.format(reason_of(error))]
+    if not (math.isfinite(gain) and bool(torch.isfinite(matrix).all())):
+        return None, [NOT_KNOWN.format("the program diverges beside them")]
+    names = tuple(part.name for part in parts)
+    return ParameterInformation(names, (matrix + matrix.T) / 2, gain, frozenset(problem.data.digests)), []
 
 
-def _observed(here: LinearizedObjective, known: Tensor) -> Tensor | None:
-    """The curvature, observed again while it is near the limits that what was known before sets it."""
+def _observed(here: LinearizedObjective, known: Tensor) -> Tensor:
+    """The curvature, observed again while it is near the limits that what was known before sets it; as far as it can
+    be observed."""
+    term = here.terms[0].term
     for _ in range(MAX_OBSERVATIONS):
-        matrix = observed(here.terms[0].term, known)
-        if matrix is None or _is_believed(known, matrix):
-            return matrix
+        matrix = observed(term, known)
+        if matrix is None or _is_believed(term.parts, known, matrix):
+            return known if matrix is None else matrix
         known = matrix
     return known
 
 
-def _is_believed(before: Tensor, matrix: Tensor) -> bool:
-    """Whether what was observed is far from the limits that `before` sets it."""
+def within_reach(parts: Sequence[Element], matrix: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """What numbers move at once, `(P,)`, the directions `(P, P)` in which these have a curvature each, and these
+    `(P,)`, no less than what leaves a direction open by that."""
+    limits = reach(parts, matrix)
+    curvature, turn = torch.linalg.eigh(limits * matrix * limits[:, None])
+    return limits, turn, curvature.clamp(min=1.0)
+
+
+def _is_believed(parts: Sequence[Element], before: Tensor, matrix: Tensor) -> bool:
+    """Whether what was observed is far from the limits that `before` sets it; from the lower one, where the drives tell
+    something within reach."""
     least, most = OBSERVED_SHARES
-    root = torch.linalg.cholesky(before)
+    limits = reach(parts, before)
+    told = torch.diag(limits.square().reciprocal())
+    shares, told_shares = _shares(before, matrix), _shares(before + told, matrix + told)
+    if shares is None or told_shares is None:
+        return False
+    return bool((shares < 0.5 * most).all() and (told_shares > 2 * least).all())
+
+
+def _shares(before: Tensor, matrix: Tensor) -> Tensor | None:
+    """Eigenvalues of one matrix by another; None where this is not positive."""
+    root, failed = torch.linalg.cholesky_ex(before)
+    if failed:
+        return None
     half = torch.linalg.solve_triangular(root, matrix, upper=False)
-    shares = torch.linalg.eigvalsh(torch.linalg.solve_triangular(root, half.T, upper=False))
-    return bool((shares > 2 * least).all() and (shares < 0.5 * most).all())
+    return torch.linalg.eigvalsh(torch.linalg.solve_triangular(root, half.T, upper=False))

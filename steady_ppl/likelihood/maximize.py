@@ -28,7 +28,6 @@ from steady_ppl.gaussian.linearize import ReferencePath
 from steady_ppl.gaussian.smoother import find_path, require_found, resting_path, smooth
 from steady_ppl.kernels.rows import kernel_failures, note_failures
 from steady_ppl.likelihood.objective import (
-    MAX_MOVE,
     PASSES,
     STALLED_PASSES,
     LinearizedObjective,
@@ -36,6 +35,7 @@ from steady_ppl.likelihood.objective import (
     by_cross_products,
     linearised,
     observed,
+    reach,
     regularised,
     tried,
 )
@@ -56,7 +56,6 @@ better of the last two did, or as the next one promises."""
 MAX_WIDENED, SHARE_OF_SLOPE = 16.0, 0.7
 """A move that was cut short may be twice as long the next time, and so on up to the first.
 It has to raise the objective by more than the second of what its slope foresaw."""
-MAX_MOVE_SD = 50.0  # standard deviations, of a number with a unit: it moves as far at once, if that is more
 SHARE_AGAINST_SCORE = 1 / 3
 """Of that, for a number whose own score points the other way: noise or a friction that is driven to nothing early has
 no score there, and a fit cannot return."""
@@ -285,7 +284,7 @@ def maximise_sum(
         require_found(at.ahead, at.term.problem)
     began, most = [at.objective for at in here.terms], here.objective
     curvature = _Curvature.of_fit(here, information)
-    reach = _reach(terms, curvature.matrix)
+    limits = _reach(terms, curvature.matrix)
     taken, decrement, passes, widened = 0, 0.0, PASSES, 1.0
     is_small, is_over = False, False
     rises = list[float]()  # of log p(y) by accepted steps
@@ -302,10 +301,11 @@ def maximise_sum(
             is_over |= is_small and (is_sure or was_small or not curvature.few_drives or taken == 0)
             if is_over or taken == steps or behind:
                 break
-            length = float((move.abs() / reach).max())
+            length = float((move.abs() / limits).max())
             move = move * min(1.0, widened / max(1e-9, length))
             against = move * here.gradient < 0
-            move = torch.where(against, move.clamp(-SHARE_AGAINST_SCORE * reach, SHARE_AGAINST_SCORE * reach), move)
+            most_against = SHARE_AGAINST_SCORE * limits
+            move = torch.where(against, move.clamp(-most_against, most_against), move)
             share, there = _line_search(here, move, passes, most - MAX_DECREASE)
             risen = -math.inf if there is None else there.objective - here.objective
             if share < 1:
@@ -344,12 +344,10 @@ def maximise_sum(
 
 def _reach(terms: Sequence[Term], information: Tensor) -> Tensor:
     """The most that each number moves at once, `(P,)`."""
-    reach = torch.zeros(len(information), dtype=torch.float64)
-    is_open = torch.zeros(len(information), dtype=torch.bool)
+    found = torch.zeros(len(information), dtype=torch.float64)
     for term in terms:
-        reach[term.columns] = torch.tensor([MAX_MOVE * part.step for part in term.parts], dtype=torch.float64)
-        is_open[term.columns] = torch.tensor([part.has_unit and not part.is_effect for part in term.parts]).bool()
-    return torch.where(is_open, torch.maximum(reach, MAX_MOVE_SD * information.diagonal().rsqrt()), reach)
+        found[term.columns] = reach(term.parts, information[term.columns][:, term.columns])
+    return found
 
 
 def _line_search(

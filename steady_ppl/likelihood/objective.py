@@ -25,6 +25,7 @@ from steady_ppl.model.program import Program
 PASSES, TOLERANCE = 3, 0.03  # linearisations a step, and when paths are at rest, in standard deviations of the noise
 STALLED_PASSES = 15  # linearisations a step once no share of a step was accepted: some path swings about its mode
 MAX_MOVE = 150  # steps of differences, 1.5 of a logarithm: the most that a number moves at once
+MAX_MOVE_SD = 50.0  # standard deviations, of a number with a unit: it moves as far at once, if that is more
 SHARE_OF_SD = 0.1  # by which a number is moved: over a whole standard deviation the score of a noise bends
 LEAST_SHARE = 1e-6  # of a number, by which it is moved at least: single precision has seven digits
 OBSERVED_SHARES = (0.01, 100.0)  # of what is known, within which what is observed is believed
@@ -120,6 +121,15 @@ def _scored(found: list[LinearizedTerm]) -> LinearizedObjective:
     return LinearizedObjective(found, torch.cat(by_drive), gradient, has_unit)
 
 
+def reach(parts: Sequence[Element], information: Tensor) -> Tensor:
+    """The most that each number moves at once, `(P,)`, by what is known of them, `(P, P)`."""
+    found = torch.tensor([MAX_MOVE * part.step for part in parts], dtype=torch.float64)
+    is_open = torch.tensor([part.has_unit and not part.is_effect for part in parts], dtype=torch.bool)
+    return torch.where(
+        is_open, torch.maximum(found, MAX_MOVE_SD * information.diagonal().clamp(min=1e-30).rsqrt()), found
+    )
+
+
 def by_cross_products(here: LinearizedObjective) -> Tensor:
     """The information by the cross products of the drives' scores."""
     by_drive = here.scores - here.scores.mean(0)
@@ -139,9 +149,10 @@ def observed(term: Term, known: Tensor, passes: int = PASSES) -> Tensor | None:
         return None
     here = linearised([term], passes)
     (there,), found = here.terms, torch.empty_like(known)
-    for part, column, own in zip(term.parts, term.columns, known.diagonal().tolist(), strict=True):
+    limits = reach(term.parts, known).tolist()
+    for part, column, own, most in zip(term.parts, term.columns, known.diagonal().tolist(), limits, strict=True):
         before = float(values_of([part]))
-        by = min(max(SHARE_OF_SD * own**-0.5, LEAST_SHARE * abs(before)), MAX_MOVE * part.step)
+        by = min(max(SHARE_OF_SD * own**-0.5, LEAST_SHARE * abs(before)), most)
         with moved(part, by):
             step = float(values_of([part])) - before  # in the parameter's own precision
             found[column] = (here.gradient - linearised([there.term], passes).gradient) / step

@@ -25,8 +25,9 @@ from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.errors import FilterError, require
 from steady_ppl.gaussian.linearize import ReferencePath
 from steady_ppl.gaussian.smoother import smooth
+from steady_ppl.likelihood.information import within_reach
 from steady_ppl.likelihood.maximize import maximise
-from steady_ppl.likelihood.objective import MAX_MOVE, PASSES, TOLERANCE, Term, linearised, log_prior, posterior_score
+from steady_ppl.likelihood.objective import PASSES, TOLERANCE, Term, linearised, log_prior, posterior_score
 from steady_ppl.likelihood.parameters import Element, elements, on_both_sides, set_values, values_of
 from steady_ppl.model.problem import Problem
 from steady_ppl.model.program import Program
@@ -146,9 +147,8 @@ class NormalShape:
 def about_maximum(problem: Problem, path: ReferencePath) -> NormalShape:
     """By the curvature where the program is; what the data do not tell is open by as much as a fit moves it at once."""
     parts = elements(problem.program)
-    reach = torch.tensor([MAX_MOVE * part.step for part in parts], dtype=torch.float64)
-    curvature, directions = torch.linalg.eigh(reach * observed_information(problem, path, parts) * reach[:, None])
-    return NormalShape(values_of(parts), reach[:, None] * directions * curvature.clamp(min=1.0).rsqrt())
+    limits, directions, curvature = within_reach(parts, observed_information(problem, path, parts))
+    return NormalShape(values_of(parts), limits[:, None] * directions * curvature.rsqrt())
 
 
 def adapt(program: Program, shape: NormalShape, judge: LogLikelihood, count: int) -> tuple[Tensor, Tensor]:

@@ -13,7 +13,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from steady_ppl.criticism.baselines import Reference
-from steady_ppl.criticism.result import Check, band, measured_values, over_floor, strips, subject, verdict
+from steady_ppl.criticism.result import Check, band, floor_name, measured_values, over_floor, strips, subject, verdict
 from steady_ppl.errors import UsageError
 from steady_ppl.model.program import unit_of
 from steady_ppl.utils.text import with_unit
@@ -128,7 +128,7 @@ def against_references(found: Check, axes: Axes) -> None:
     """Errors over the noise floor, root mean square over the components, against the time ahead."""
     horizons = list(found.horizons.values())
     seconds = [horizon * found.data.median_step for horizon in horizons]
-    axes.axhline(1, color=FLOOR_COLOR, lw=1.5, label="noise alone")
+    axes.axhline(1, color=FLOOR_COLOR, lw=1.5, label=floor_name(found))
 
     def line(errors: Mapping[int, tuple[Any, Any]], style: str, color: str, label: str) -> None:
         relative = [over_floor(*errors[horizon], found.floor[horizon]) for horizon in horizons]
@@ -143,7 +143,7 @@ def against_references(found: Check, axes: Axes) -> None:
     axes.yaxis.set_major_formatter("{x:g}")
     axes.yaxis.set_minor_formatter("{x:g}")
     axes.set_title("against references: root mean square error over all measurements")
-    axes.set(xlabel="predicted ahead [s]", ylabel="RMSE / noise alone")
+    axes.set(xlabel="predicted ahead [s]", ylabel=f"RMSE / {floor_name(found)}")
     axes.legend(fontsize=7)
 
 

@@ -23,7 +23,7 @@ from steady_ppl.data.doctor import Examination
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.effects import Effect, attached, written_class
 from steady_ppl.errors import SteadyError, UsageError
-from steady_ppl.model.program import parameter_rows
+from steady_ppl.model.program import for_program, parameter_rows
 from steady_ppl.reporting.drives import Shown, chosen_drives, common_data, data_of_run, where_to_look
 from steady_ppl.runs.diagnostics import doctor
 from steady_ppl.runs.fit import Fit, versions
@@ -244,10 +244,12 @@ def report(
     table = doctor(data, next(iter(runs.values())).program)
     plan = [(f"checking {label}", 4) for label in runs] + [(f"drawing {label}", 1) for label in runs]
     with stages(*plan, ("comparing", len(runs))) as begin:
-        checks = {}
+        checks, table_of_all = {}, data
         for label, fit in runs.items():
             begin()
-            checks[label] = check(fit, data, simulations=simulations, horizons=horizons, seed=seed)
+            known = fit.information
+            seen = known is not None and known.has_seen(for_program(fit.program, table_of_all))
+            checks[label] = check(fit, data, simulations=simulations, horizons=horizons, has_seen=seen, seed=seed)
             data = checks[label].outliers.without(data)  # what a run finds wrong is left out for all that follow
         shown = chosen_drives(list(checks.values()))
         drawn = []

@@ -81,6 +81,7 @@ def test_progress_is_no_answer() -> None:
     said = "steady: scoring steps … 2 min gone by, about 4 min left steady: finding paths … 14 s gone by, about to end"
     said += " steady: drawing states … 20 s gone by steady: done"
     assert others.PROGRESS.sub("", said) == "steady: done"
+    assert others.PROGRESS.sub("", f"steady: 24 cells are -9999 {said}") == "steady: 24 cells are -9999 steady: done"
 
 
 @pytest.mark.exhaustive

@@ -64,7 +64,7 @@ def test_what_it_adds_is_a_program_that_was_fitted(told: tuple[Path, list[str]])
 def test_predictions_of_the_locked_drives_get_better(told: tuple[Path, list[str]]) -> None:
     out, lines = told
     rows = {row["row"]: row for row in json.loads((out / "proof.json").read_text())["rows"]}
-    assert list(rows) == ["before", "after", "oracle", "truth", "constant velocity", "noise floor"]
+    assert list(rows) == ["before", "after", "oracle", "truth", "constant velocity", "last measurement", "noise floor"]
     for ahead in ("3 s", "10 s"):
         assert rows["after"]["measurement"]["rad"][ahead] < 0.8 * rows["before"]["measurement"]["rad"][ahead]
     assert any(line.split()[:1] == ["after"] for line in lines)

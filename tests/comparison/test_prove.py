@@ -276,7 +276,7 @@ def test_the_command_writes_figures_and_a_picture(tmp_path, work, capsys):
     content = json.loads((tmp_path / "proof.json").read_text())
     assert content["runs"] == {"hand": str(runs[0]), "steady": str(runs[1]), "oracle": str(runs[0])}
     named = [row["row"] for row in content["rows"]]
-    assert named == ["hand", "steady", "oracle", "truth", "constant velocity", "noise floor"]
+    assert named == ["hand", "steady", "oracle", "truth", "constant velocity", "last measurement", "noise floor"]
     assert (tmp_path / "proof.png").read_bytes().startswith(b"\x89PNG")
     assert " ".join(capsys.readouterr().out.split()).startswith(content["verdict"])
     assert steady("prove", *runs, table, "--json", "-") == 0
@@ -325,9 +325,12 @@ def by_particles(proof, name: str, change: float | str):
 def test_particles_rule_where_they_see_log_p_y_otherwise(drag) -> None:
     gain = line(drag, "after")["against_reference"]["log_likelihood"]["difference"]
     said = by_particles(drag, "after", -gain - 50.0).figures["verdict"]
-    assert said.startswith("after fits worse and predicts better than before: log p(y) (by particles; linearised +")
+    assert said.startswith("after fits worse and predicts better than before: log p(y) by particles (linearised +")
     assert "−50.0 nats a drive" in said
     assert "particles" not in by_particles(drag, "after", 0.5).figures["verdict"]
+    assert (
+        by_particles(drag, "after", 20.0).figures["verdict"].startswith("after is better than before: log p(y) by par")
+    )
 
 
 @pytest.mark.parametrize("who", ["before", "after"])

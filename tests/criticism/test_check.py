@@ -364,21 +364,39 @@ def test_what_a_fit_could_not_know_is_no_fault(off) -> None:
     assert sure.blame.kind == "parameters" and "fit it again first" in str(sure)
     others = st.simulate(fit.program, 3, seed=9)
     open_ = st.check(known_by(fit, for_program(fit.program, others), 0.1), data, simulations=40)
-    assert open_.unseen and open_.blame.p_values["parameters"] > 0.05
+    assert open_.is_open and open_.blame.p_values["parameters"] > 0.05
     assert open_.figures["parameter_uncertainty"] is True
+    assert "noise and fit" in str(open_) and "bands hold what its own drives leave open" in str(open_)
+    assert "noise alone" in str(sure) and "bands hold" not in str(sure)
 
 
 def test_on_its_own_drives_a_fits_uncertainty_does_not_count(off) -> None:
     fit, data = off
     found = st.check(known_by(fit, for_program(fit.program, data), 0.1), data, simulations=40)
-    assert not found.unseen and found.blame.kind == "parameters"
+    assert not found.is_open and found.blame.kind == "parameters"
+    masked = st.check(
+        known_by(fit, for_program(fit.program, data), 0.1), data.subset([1]), has_seen=False, simulations=20
+    )
+    assert masked.is_open and any("1 of these drives are the fit's own" in note for note in masked.notes)
+
+
+def test_numbers_that_lead_anywhere_are_taken_as_exact(off) -> None:
+    fit, data = off
+    others = for_program(fit.program, st.simulate(fit.program, 3, seed=9))
+    found = st.check(known_by(fit, others, 1e6), data, simulations=20)
+    if not found.is_open:
+        assert any("parameters are taken as exact" in note for note in found.notes)
+    assert found.blame.kind in ("nothing found", "parameters")
 
 
 @pytest.mark.parametrize(
     ("gain", "says"),
     [
-        (0.01, "though on its own drives its fit has ended: what it lacks is no number of it; `steady discover`"),
-        (7.0, "and its fit had not ended (a longer one gains 7 nats): fit it again first"),
+        (
+            0.01,
+            "though its fit has ended: either these drives are of another vehicle, or it lacks what is no number;",
+        ),
+        (7.0, "and its fit had not ended (a longer one gains 7 nats, linearised): fit it again first"),
     ],
 )
 def test_a_fit_that_has_ended_is_not_sent_back(off, gain: float, says: str) -> None:

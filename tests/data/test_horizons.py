@@ -1,4 +1,5 @@
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -37,7 +38,8 @@ def test_units_noise_and_gaps_do_not_move_it() -> None:
 
 
 def test_a_heading_that_comes_round_moves_no_faster_than_it_turns() -> None:
-    assert time_scale(waves(0.8, 0.1, turns=True)) == 1.0
+    assert time_scale(waves(0.8, 0.1, turns=True), torch.tensor([True])) == 1.0
+    assert time_scale(waves(0.8, 0.1, turns=True)) < 1.0
 
 
 def test_one_row_of_a_fast_circuit_is_the_least() -> None:
@@ -51,5 +53,30 @@ def test_drives_that_do_not_move_have_a_tenth_of_their_length() -> None:
 def test_times_that_are_asked_for_come_first() -> None:
     assert named_horizons(waves(0.8, 0.1), 2, [2.5, 0.5]) == {"one step": 1, "0.5 s": 5, "2.5 s": 25}
     assert list(named_horizons(waves(0.8, 0.1), 3)) == ["one step", "1 s", "3 s", "10 s"]
-    with pytest.raises(UsageError, match="seconds above zero"):
-        named_horizons(waves(0.8, 0.1), 2, [-1.0])
+    for wrong in (-1.0, math.inf, 0.1, 40.0):
+        with pytest.raises(UsageError, match="horizons"):
+            named_horizons(waves(0.8, 0.1), 2, [wrong])
+    with pytest.raises(UsageError, match="the same number of rows"):
+        named_horizons(waves(0.8, 0.1), 2, [0.5, 0.52])
+
+
+@pytest.mark.parametrize("every", [1, 3, 10])
+def test_a_measurement_that_comes_seldom_moves_no_slower(every: int) -> None:
+    slow = waves(0.8 / 3, 0.1, rows=600)
+    observed = torch.zeros_like(slow.observed)
+    observed[::every] = True
+    assert time_scale(replace(slow, observed=observed)) == 3.0
+
+
+def test_a_column_of_noise_alone_tells_nothing() -> None:
+    slow, noisy = waves(0.8 / 3, 0.1, rows=600), waves(0.8, 0.1, rows=600, size=0.0, noise=1.0)
+    both = [torch.cat([getattr(one, name) for one in (slow, noisy)], -1) for name in ("measurements", "observed")]
+    assert time_scale(replace(slow, measurements=both[0], observed=both[1])) == 3.0
+
+
+def test_what_forgets_itself_within_two_rows_has_the_shortest_times() -> None:
+    random, values = torch.Generator().manual_seed(1), [torch.zeros(8).double()]
+    for _ in range(599):
+        values.append(0.3 * values[-1] + torch.randn(8, generator=random).double())
+    fast = replace(waves(0.8, 0.1, rows=600), measurements=torch.stack(values).unsqueeze(-1))
+    assert time_scale(fast) <= 0.3

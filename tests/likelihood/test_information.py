@@ -8,9 +8,13 @@ import pytest
 import torch
 from examples import drives, example
 from oracles import cart_evidence
+from pyro.distributions import constraints
+from pyro.nn import PyroParam
 from torch import Tensor
 
-from steady_ppl import Trajectories
+from steady_ppl import Trajectories, for_program
+from steady_ppl.gaussian.linearize import ReferencePath
+from steady_ppl.gaussian.smoother import smooth
 from steady_ppl.likelihood.information import ParameterInformation, information_of_fit
 from steady_ppl.likelihood.maximize import fit_by_likelihood
 from steady_ppl.likelihood.parameters import elements, set_values, values_of
@@ -93,6 +97,62 @@ def test_what_is_not_told_is_open_by_as_much_as_a_fit_moves_it() -> None:
     with seeded(0, "draws"):
         drawn = vague.draws(problem.program, 1000)
     assert bool((drawn.std(0) > 0.3).all()) and bool((drawn.std(0) < 10).all())
+
+
+@pytest.mark.parametrize("kind", [torch.float32, torch.float64])
+@pytest.mark.parametrize("trajectories", [1, 6])
+def test_a_number_that_nothing_tells_leaves_a_fit_with_nothing_to_gain(trajectories: int, kind: torch.dtype) -> None:
+    class Idle(type(example("linear_gaussian"))):
+        def __init__(self) -> None:
+            super().__init__()
+            self.idle = PyroParam(torch.tensor(1.0), constraints.positive)
+
+    program = Idle().to(kind)
+    data = for_program(program, drives(example("linear_gaussian"), trajectories, 81, seed=3))
+    with seeded(0, "paths"):
+        path = fit_by_likelihood(program, data).path
+    found, notes = information_of_fit(Problem(program, data), path)
+    assert not notes and found is not None and 0 <= found.gain < 0.5
+    with seeded(0, "draws"):
+        open_by = found.draws(program, 500).std(0)[found.names.index("idle")]
+    assert 0.5 < float(open_by) < 3
+
+
+def test_draws_of_a_number_with_a_unit_do_not_depend_on_the_unit() -> None:
+    """A bias that is open by ten metres, or by a hundredth of a kilometre."""
+
+    class Biased(type(example("linear_gaussian"))):
+        def __init__(self) -> None:
+            super().__init__()
+            self.bias = PyroParam(torch.tensor(0.0))
+
+    program = Biased()
+    for sd in (1e-3, 1.0, 10.0, 1e4):
+        known = ParameterInformation(("bias",), torch.tensor([[sd**-2]]).double(), 0.0, frozenset())
+        for name, parameter in program.named_parameters():
+            parameter.requires_grad_(name.startswith("bias"))
+        with seeded(0, "draws"):
+            assert float(known.draws(program, 4000).std()) == pytest.approx(sd, rel=0.05)
+
+
+def test_a_program_that_fails_beside_its_fit_keeps_the_fit() -> None:
+    class Brittle(type(example("linear_gaussian"))):
+        def transition(self, state, control, time, step):
+            if abs(float(self.gain.detach()) - 1.0) > 1e-3:
+                raise ValueError("no gain but one")
+            return super().transition(state, control, time, step)
+
+    program = Brittle()
+    data = for_program(program, drives(example("linear_gaussian"), 6, 81, seed=3))
+    with torch.no_grad():
+        program.gain = torch.tensor(1.0)
+    path = smooth(Problem(program, data), known_path(data)).linearization.path
+    found, notes = information_of_fit(Problem(program, data), path)
+    assert found is None and "no gain but one" in notes[0]
+
+
+def known_path(data: Trajectories) -> ReferencePath:
+    return ReferencePath(data.states, torch.zeros_like(data.states[1:, :, :1]))
 
 
 def test_it_knows_the_drives_that_it_has_seen() -> None:
