@@ -13,7 +13,7 @@ from torch import Tensor
 
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.gaussian.information_filter import look_ahead
-from steady_ppl.gaussian.lanes import Array
+from steady_ppl.gaussian.lanes import Array, in_lanes, out_of_lanes
 from steady_ppl.gaussian.linearize import ReferencePath, linearize
 from steady_ppl.gaussian.posterior_moments import Posterior, posterior_moments
 from steady_ppl.model.problem import Problem
@@ -86,3 +86,12 @@ def test_one_that_is_no_number_leaves_the_others_as_they_are(count: int, value: 
     others = torch.arange(count) != 1
     for part, expected in zip(after, before, strict=True):
         assert torch.equal(part[others], expected[others])
+
+
+@pytest.mark.parametrize("drives", [1, 2, 3, 8, 9, 16])
+def test_lanes_hold_what_they_are_given_and_zeros_beyond(drives: int) -> None:
+    given = torch.randn(4, drives, 3, 2, dtype=torch.float64)
+    blocks = in_lanes(given)
+    assert blocks.flags.c_contiguous
+    assert torch.equal(out_of_lanes(blocks, drives), given)
+    assert not torch.from_numpy(blocks).movedim(-1, 2).flatten(1, 2)[:, drives:].any()

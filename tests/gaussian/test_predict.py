@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 
 import pytest
@@ -10,10 +11,11 @@ from examples import copies, drives, example
 from oracles import assert_mean, cart_parameters, cart_system, kalman
 from paths import anywhere
 
-from steady_ppl import seeded
+from steady_ppl import for_program, seeded, simulate, with_substeps
 from steady_ppl.gaussian.kalman import track
-from steady_ppl.gaussian.predict import on_a_circle, predict, simulate_again
+from steady_ppl.gaussian.predict import on_a_circle, predict, simulate_again, simulate_each
 from steady_ppl.gaussian.smoother import find_and_smooth
+from steady_ppl.kernels.rows import kernel_failures
 from steady_ppl.model.problem import Problem
 
 
@@ -77,3 +79,25 @@ def test_bearings_live_on_a_circle_and_positions_do_not(cart, even):
     data = drives(hovercraft, 2, 5)
     assert on_a_circle(hovercraft, data, data.states).tolist() == [True] * 4
     assert on_a_circle(cart, even, even.states).tolist() == [False]
+
+
+@pytest.mark.parametrize("drives_of_set", [1, 3])
+@pytest.mark.parametrize("substeps", [1, 4])
+def test_sets_of_several_programs_are_each_ones_own(substeps: int, drives_of_set: int) -> None:
+    """The second program's are by kernels as well, and move as its numbers say."""
+    hovercraft = with_substeps(example("hovercraft", torch.float32), substeps).requires_grad_(False)
+    other = copy.deepcopy(hovercraft)
+    other.mass = torch.tensor(4.0)
+    data = for_program(hovercraft, simulate(hovercraft, drives_of_set, seed=0))
+    starts = data.known_start.expand(2, -1, -1)
+    with seeded("each"), kernel_failures() as why:
+        _, both = simulate_each([hovercraft, other], data, [starts[:1], starts[1:]], 3)
+    assert not why
+    with seeded("each"):
+        _, first = simulate_again(hovercraft, data, starts[:1], 3)
+        _, second = simulate_again(other, data, starts[1:], 3)
+    found, expected = (torch.cat([one.states for one in part], 1) for part in ([both], [first, second]))
+    torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-4)
+    torch.testing.assert_close(both.noise, torch.cat([first.noise, second.noise], 1), rtol=0, atol=0)
+    apart = (found[-1, :drives_of_set] - found[-1, drives_of_set:]).abs().max()
+    assert float(apart) > 0.1

@@ -15,7 +15,7 @@ from paths import anywhere, at_its_mode, near_the_truth
 
 from steady_ppl import for_program, seeded, simulate
 from steady_ppl.gaussian.linearize import ReferencePath
-from steady_ppl.gaussian.smoother import find_and_smooth, find_path, smooth
+from steady_ppl.gaussian.smoother import _penalty, find_and_smooth, find_path, smooth
 from steady_ppl.likelihood.evidence import neglected
 from steady_ppl.model.problem import Problem
 from steady_ppl.utils.angles import wrap
@@ -157,3 +157,17 @@ def test_a_path_that_swings_about_its_mode_comes_to_rest(known_start, below, eve
     data = replace(even, measurements=torch.full_like(even.measurements, -below))
     ahead = smooth(Problem(program, data, known_start), near_the_truth(program, even), passes=40, tolerance=1e-6)
     torch.testing.assert_close(ahead.path(data).noise, ahead.linearization.path.noise, rtol=0, atol=1e-5)
+
+
+def test_a_defects_price_is_twice_the_pull_of_all_measurements(uneven, cart):
+    problem = Problem(cart, uneven)
+    with seeded(0, "path"):
+        path = find_path(problem)
+    ahead = smooth(problem, path, passes=1)
+    moved = ahead.path(uneven)
+    linear = ahead.linearization
+    away = (moved.states - linear.path.states).double()
+    apart = linear.residual - torch.einsum("tbkd,tbd->tbk", linear.measurement, away)
+    now = torch.einsum("tbkd,tbk->tbd", linear.measurement, linear.precision * apart)
+    later = ahead.information - torch.einsum("tbde,tbe->tbd", ahead.precision, away)
+    torch.testing.assert_close(_penalty(ahead, moved), 2 * (now + later).abs())

@@ -7,6 +7,7 @@ import importlib.metadata
 import json
 import os
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import arviz
@@ -18,7 +19,9 @@ from small import HOVERCRAFT, TRUTH, contents, simulated, steady, written
 
 from steady_ppl import Fit, Program, ProgramError, RunError, SteadyError, Trained, load_program, write_table
 from steady_ppl.comparison.evaluate import evaluate
+from steady_ppl.likelihood.information import ParameterInformation
 from steady_ppl.runs.recipes import run_recipe
+from steady_ppl.utils.tensor_files import write_tensors
 
 FILES = {"parameters.safetensors", "posterior.nc", "run.json"}
 NEURAL = f"{MODELS / 'neural_vehicle.py'}:NeuralHovercraft"
@@ -365,3 +368,25 @@ def test_a_program_named_wrongly_is_an_error_of_the_program(tmp_path: Path) -> N
     fitted().save(tmp_path / "run")
     with pytest.raises(ProgramError, match="no file"):
         Fit.load(tmp_path / "run", tmp_path / "nowhere.py")
+
+
+def test_what_the_drives_determine_is_saved_and_read_and_its_damage_is_told(tmp_path: Path) -> None:
+    matrix = torch.tensor([[4.0, 1.0], [1.0, 3.0]]).double()
+    known = ParameterInformation(("mass", "inertia"), matrix, 0.25, frozenset(["a", "b"]))
+    replace(fitted(), information=known).save(tmp_path / "run")
+    again = Fit.load(tmp_path / "run").information
+    assert again is not None and torch.equal(again.matrix, matrix)
+    assert (again.names, again.gain, again.drives) == (known.names, known.gain, known.drives)
+    file = tmp_path / "run" / "information.safetensors"
+    for text in ({}, {"names": "[]", "gain": "NaN", "drives": "[]"}, {"names": '"ab"', "gain": "0", "drives": "[]"}):
+        write_tensors(file, {"matrix": matrix}, text)
+        with pytest.raises(RunError, match=r"information\.safetensors in .* is damaged"):
+            Fit.load(tmp_path / "run")
+
+
+def test_a_training_that_is_gone_on_with_leaves_nothing_of_what_was_known(tmp_path: Path) -> None:
+    known = ParameterInformation(("mass",), torch.eye(1).double(), 0.0, frozenset())
+    (tmp_path / "run").mkdir()
+    replace(fitted(), information=known).save_into(tmp_path / "run")
+    fitted().save_into(tmp_path / "run")
+    assert Fit.load(tmp_path / "run").information is None
