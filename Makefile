@@ -53,7 +53,7 @@ test-all: $(INSTALLED)
 	$(BIN)/python -m pytest --numprocesses 2 --dist loadfile --no-loadscope-reorder -m "slow or not slow" --durations 25
 
 test-share: $(INSTALLED)
-	$(BIN)/python -m pytest --numprocesses 2 --dist worksteal -m exhaustive --share $(SHARE) --durations 25
+	$(BIN)/python -m pytest --numprocesses 2 --dist loadfile --no-loadscope-reorder -m exhaustive --share $(SHARE) --durations 25
 
 calibrate: $(INSTALLED)
 	$(BIN)/python benchmarks/calibrate.py $(if $(QUICK),--quick) --results $(OUT)/calibration.jsonl
