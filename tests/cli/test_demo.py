@@ -32,8 +32,9 @@ def told(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[str]]:
 def test_it_goes_through_the_loop_and_keeps_everything(told: tuple[Path, list[str]]) -> None:
     out, lines = told
     commands = [line.split()[2] for line in lines if line.startswith("   $ steady")]
-    assert commands == ["simulate"] * 3 + ["fit", "check", "discover", "add", "fit", "fit", "prove", "report"]
-    for file in (*FILES, "report.html", "train.csv", "valid.csv", "test.csv"):
+    learned = ["fit", "check", "discover", "add", "fit", "fit"]
+    assert commands == ["simulate"] * 3 + learned + ["prove", "check", "report"]
+    for file in (*FILES, "after.json", "after.txt", "report.html", "train.csv", "valid.csv", "test.csv"):
         assert (out / file).stat().st_size > 0
     record = json.loads((out / DEMO_RECORD).read_text())
     assert record["status"] == "finished"
