@@ -1,9 +1,9 @@
-"""Whom `check` accuses on drives that the fit has not seen: right models, and models that lack an effect.
+"""How often `check` reports a fault on drives that the fit has not seen, of right models and of others.
 
     python benchmarks/unseen.py [--sets 50] [--only BEGINNING ...] [--results FILE] [--workers 2]
 
 A job makes drives in the continuous worlds of `continuous_worlds.py`, fits the program that a user would write to some
-of them by a recipe, and checks it on others. Asked for: a right model is accused in 5 % of the sets, an effect of
+of them by a recipe, and checks it on others. Asked for: a fault of a right model in 5 % of the sets, an effect of
 twice its detection limit in 90 %, with the kind right in 85 %. Writes `results/unseen.md` and exits with 1 when a must
 is missed.
 """
@@ -119,7 +119,7 @@ def interval(count: int, total: int) -> tuple[float, float]:
 
 def table(records: list[Record]) -> tuple[list[str], bool]:
     """The table of these records in Markdown, and whether nothing that must hold is missed."""
-    head = "| fitted and checked | vehicle | sets | accused | 95 % interval | p-values uniform | kind right |"
+    head = "| fitted and checked | vehicle | sets | faults reported | 95 % interval | p-values uniform | kind right |"
     lines, good = [head, f"|{'---|' * 7}"], True
     for setting in SETTINGS:
         of_setting = [one for one in records if one["setting"] == setting.name and "failed" not in one]
@@ -127,21 +127,21 @@ def table(records: list[Record]) -> tuple[list[str], bool]:
             chosen = [one for one in of_setting if vehicle in (None, one["vehicle"])]
             if not chosen:
                 continue
-            accused = [one for one in chosen if one["who"] != "nothing found"]
-            low, high = interval(len(accused), len(chosen))
-            right = [one for one in accused if one["who"] == one.get("kind") or one.get("kind") not in FAULT_KINDS]
+            reported = [one for one in chosen if one["who"] != "nothing found"]
+            low, high = interval(len(reported), len(chosen))
+            right = [one for one in reported if one["who"] == one.get("kind") or one.get("kind") not in FAULT_KINDS]
             beside = "two-sided" if setting.others else "greater"  # on its own drives a fit has scores of zero
             uniform = stats.kstest([one["p_value"] for one in chosen], "uniform", alternative=beside)
             if setting.planted:
-                met = len(accused) >= MIN_POWER * len(chosen) and len(right) >= MIN_RIGHT * len(accused)
+                met = len(reported) >= MIN_POWER * len(chosen) and len(right) >= MIN_RIGHT * len(reported)
             elif setting.others:
                 met = low <= LEVEL <= high
             else:
-                met = len(accused) <= (LEVEL + 2 * (LEVEL * (1 - LEVEL) / len(chosen)) ** 0.5) * len(chosen)
+                met = len(reported) <= (LEVEL + 2 * (LEVEL * (1 - LEVEL) / len(chosen)) ** 0.5) * len(chosen)
             good = good and (met or vehicle is not None)
-            cells = [setting.name, vehicle or "all", str(len(chosen)), f"{len(accused) / len(chosen):.1%}"]
+            cells = [setting.name, vehicle or "all", str(len(chosen)), f"{len(reported) / len(chosen):.1%}"]
             cells += [f"{low:.1%} to {high:.1%}", "" if setting.planted else f"p = {uniform.pvalue:.2f}"]
-            cells += [f"{len(right) / max(1, len(accused)):.0%}" if setting.planted else ""]
+            cells += [f"{len(right) / max(1, len(reported)):.0%}" if setting.planted else ""]
             lines.append(f"| {' | '.join(cells)} |")
     return lines, good
 

@@ -2,7 +2,7 @@
 
 import itertools
 import textwrap
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -154,13 +154,15 @@ def _by_key(found: Proof, values: Mapping[Key, Any]) -> dict[str, Any]:
 
 def changes(found: Proof, name: str) -> dict[Key, Change | None]:
     """A row's figures less the reference's, at the horizons that have names."""
-    return _differences(found, name, found.reference)
+    wanted = {0, *found.horizons.values()}
+    keys = [key for key in found.rows[name].sums if key.horizon in wanted and key.kind != MEASURED_BEFORE]
+    return _differences(found, name, found.reference, keys)
 
 
-def _differences(found: Proof, name: str, other: str) -> dict[Key, Change | None]:
-    theirs, wanted = found.rows[other].sums, {0, *found.horizons.values()}
-    ours = {key: sums for key, sums in found.rows[name].sums.items() if key in theirs and key.horizon in wanted}
-    return {key: paired(sums, theirs[key], seed=found.seed) for key, sums in ours.items()}
+def _differences(found: Proof, name: str, other: str, keys: Iterable[Key]) -> dict[Key, Change | None]:
+    """A row's figures less another's, of those that both have."""
+    ours, theirs = found.rows[name].sums, found.rows[other].sums
+    return {key: paired(ours[key], theirs[key], seed=found.seed) for key in keys if key in ours and key in theirs}
 
 
 def verdict(found: Proof) -> str:
@@ -170,7 +172,7 @@ def verdict(found: Proof) -> str:
     changed = changes(found, name)
     likely, how = _ruling(found, name, changed)
     horizon = _far(found)
-    errors = _errors_at(found, horizon, changed)
+    errors = {key.of: change for key, change in changed.items() if key[::2] == ("measurement", found.horizons[horizon])}
     parts = [f"log p(y) {how}{with_interval(likely.difference, likely.interval, 1, ' nats a drive')}"] if likely else []
     parts += [how] if how and not likely else []
     for of, change in errors.items():
@@ -187,11 +189,6 @@ def verdict(found: Proof) -> str:
 def _far(found: Proof) -> str:
     """The horizon of which the sentence speaks."""
     return list(found.horizons)[:BANDED_HORIZONS][-1]
-
-
-def _errors_at(found: Proof, horizon: str, changed: Mapping[Key, Change | None]) -> dict[str, Change | None]:
-    """How the errors of measurements differ, by their unit."""
-    return {key.of: change for key, change in changed.items() if key[::2] == ("measurement", found.horizons[horizon])}
 
 
 def _ruling(found: Proof, name: str, changed: Mapping[Key, Change | None]) -> tuple[Change | None, str]:
@@ -226,8 +223,8 @@ def _no_models(found: Proof, name: str) -> str:
     for one in (found.reference, name):
         for simple, (kind, words) in SIMPLE_ROWS.items():
             if simple in found.rows and one not in lost:
-                differences = _differences(found, one, simple)
-                errors = [change for key, change in differences.items() if key[::2] == (kind, found.horizons[horizon])]
+                keys = [key for key in found.rows[one].sums if key[::2] == (kind, found.horizons[horizon])]
+                errors = _differences(found, one, simple, keys).values()
                 if errors and all(change is not None and change.interval[0] > 0 for change in errors):
                     lost[one] = words
     if name not in lost:

@@ -22,6 +22,7 @@ from steady_ppl.criticism.residual_maps import Residuals, misfit_of
 from steady_ppl.criticism.result import Check
 from steady_ppl.criticism.step_size import check_step
 from steady_ppl.data.frozen_sensors import frozen_stretches
+from steady_ppl.data.horizons import named_horizons
 from steady_ppl.data.table import refuse_long
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.errors import DataError, FilterError, UsageError
@@ -46,7 +47,7 @@ MAX_ROWS_OF_DRAWS = 60_000  # rows times draws of the parameters, each of which 
 BANDS_HOLD = (
     "these drives are not those of the fit: bands hold what its own drives leave open of its parameters as well"
 )
-BANDS_HOLD_NOT = "parameters are taken as exact: within what the fit's drives leave open of them the program blows up"
+BANDS_HOLD_NOT = "parameters are taken as exact: within what the fit's drives leave open of them the program diverges"
 MAX_RESIDUAL_SD = 4.0  # of a single residual; beside a landmark the linearised program knows no more
 
 
@@ -92,6 +93,7 @@ def check(
     refuse_long(run)
     require_linear(problem, "check needs a program that can be linearised")
     known = fit.information if fit.information is not None and fit.information.suits(program) else None
+    ahead_by = named_horizons(run, CHECK_HORIZONS, horizons) if horizons else {}  # a wrong one is refused at once
     if has_seen is None:
         has_seen = known is not None and known.has_seen(run)
     parts = (("finding paths", 1), ("comparing time steps", 1), ("simulating drives", 2), ("judging", 2))
@@ -105,7 +107,7 @@ def check(
                 problem = replace(problem, data=run)
                 ahead = find_and_smooth(problem)
             path = ahead.linearization.path
-            ahead_by = suited_horizons(program, run, CHECK_HORIZONS, horizons)
+            ahead_by = ahead_by or suited_horizons(program, run, CHECK_HORIZONS, ())
             real = track(problem, path, passes=1)
             _, drawn, _ = ahead.draws(simulations)
             starts = run.known_start.expand(simulations, -1, -1) if fit.known_start else drawn[:, 0]

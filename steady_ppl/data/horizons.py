@@ -95,7 +95,7 @@ def _rows_of_move(values: Tensor, seen: Tensor) -> int | None:
         lags.append(lag)
     shares = [share(lag) for lag in lags]
     rise = (shares[1] - shares[0]) / 3 if len(shares) > 1 else 0.0  # of squares of one and two lags
-    noise = min(max(0.0, shares[0] - max(0.0, rise)), shares[0])
+    noise = max(0.0, shares[0] - max(0.0, rise))
     if noise > MAX_SHARE_OF_NOISE:
         return None
     return next((lag for lag, one in zip(lags, shares, strict=True) if one - noise >= SHARE_MOVED * (1 - noise)), None)

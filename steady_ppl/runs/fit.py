@@ -109,7 +109,7 @@ class Fit(Displayed):
         self, folder: Path, train: Trajectories | None = None, begun: Mapping[str, Any] | None = None
     ) -> None:
         """Write into an open run folder; `begun` is what its record already says."""
-        (folder / INFORMATION).unlink(missing_ok=True)  # of a training that is gone on with
+        (folder / INFORMATION).unlink(missing_ok=True)  # that a resumed training may have left
         write_tensors(folder / PARAMETERS, self.program.state_dict())
         if self.information is not None:
             write_tensors(folder / INFORMATION, *self.information.as_tensors())
