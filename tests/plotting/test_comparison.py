@@ -23,7 +23,8 @@ def proof() -> st.Proof:
 @pytest.mark.slow
 def test_the_picture_has_a_line_for_each_row_and_a_grey_floor(proof):
     axes = open_loop_picture(proof)
-    assert [found.get_label() for found in axes.get_lines()] == ["before", "after", "constant velocity"]
+    rows = ["before", "after", "constant velocity", "last measurement"]
+    assert [found.get_label() for found in axes.get_lines()] == rows
     assert [found.get_label() for found in axes.collections] == ["noise floor"]
     assert axes.get_xlabel() == "predicted ahead [s]" and axes.get_ylabel().endswith("[rad]")
     seconds, errors = axes.get_lines()[0].get_data()
