@@ -29,7 +29,9 @@ NAME_COLUMNS = 20  # characters of a row's name
 NOISE_FLOOR, CONSTANT_VELOCITY, LAST_MEASUREMENT = "noise floor", "constant velocity", "last measurement"
 """Rows that `prove` adds; a model has to beat the last two."""
 BASELINE_ROWS = (NOISE_FLOOR, CONSTANT_VELOCITY, LAST_MEASUREMENT, "oracle", "truth")  # that show what is possible
+MAX_PLAIN = 1e6  # nats or percent that are written without a power of ten
 MAX_DOUBT = 2.0  # nats a drive by which particles may see a difference of log p(y) otherwise, surely
+MIN_LOSS = 0.1  # share of a simple row's error, by which a program that is no model errs more at least
 SIMPLE_ROWS = {  # what knows nothing of the vehicle: the errors to compare, and what it is in words
     CONSTANT_VELOCITY: ("measurement", "a vehicle that keeps its velocity"),
     LAST_MEASUREMENT: (MEASURED_BEFORE, "the last measurement"),
@@ -218,23 +220,37 @@ def _neglected(sums: Mapping[Key, Sums]) -> Sums:
 
 
 def _no_models(found: Proof, name: str) -> str:
-    """That programs predict worse, in every unit, than what knows nothing of the vehicle."""
-    horizon, lost = _far(found), dict[str, str]()
-    for one in (found.reference, name):
-        for simple, (kind, words) in SIMPLE_ROWS.items():
-            if simple in found.rows and one not in lost:
-                keys = [key for key in found.rows[one].sums if key[::2] == (kind, found.horizons[horizon])]
-                errors = _differences(found, one, simple, keys).values()
-                if errors and all(change is not None and change.interval[0] > 0 for change in errors):
-                    lost[one] = words
+    """That programs predict worse than what knows nothing of the vehicle."""
+    lost = {one: by for one in (found.reference, name) if (by := _lost_to(found, one))}
     if name not in lost:
         return ""
-    if len(lost) == 1:
-        return f"{name} is not yet a model: {horizon} ahead it errs more than {lost[name]}. "
-    neither = f"Neither {found.reference} nor {name} is yet a model: {horizon} ahead"
-    if lost[name] == lost[found.reference]:
-        return f"{neither} both err more than {lost[name]}. "
-    return f"{neither} the one errs more than {lost[found.reference]}, the other more than {lost[name]}. "
+    horizon, words = lost[name]
+    if found.reference not in lost:
+        return f"{name} is not yet a model: {horizon} ahead it errs more than {words}. "
+    neither = f"Neither {found.reference} nor {name} is yet a model"
+    other, others = lost[found.reference]
+    if (horizon, words) == (other, others):
+        return f"{neither}: {horizon} ahead both err more than {words}. "
+    return f"{neither}: {other} ahead the one errs more than {others}, {horizon} ahead the other more than {words}. "
+
+
+def _lost_to(found: Proof, name: str) -> tuple[str, str] | None:
+    """How far ahead, and to what that knows nothing of the vehicle, a program surely loses by a tenth; None where it
+    surely wins at some time ahead or in some unit."""
+    horizons = list(reversed(list(found.horizons)[:BANDED_HORIZONS]))
+    for simple, (kind, words) in SIMPLE_ROWS.items():
+        if simple not in found.rows:
+            continue
+        at = dict[str, list[Change]]()
+        for horizon in horizons:
+            keys = [key for key in found.rows[name].sums if key[::2] == (kind, found.horizons[horizon])]
+            at[horizon] = [change for change in _differences(found, name, simple, keys).values() if change]
+        if any(change.interval[1] < 0 for changes in at.values() for change in changes):
+            continue
+        for horizon, changes in at.items():
+            if any(change.interval[0] > 0 and (change.relative or 0.0) > MIN_LOSS for change in changes):
+                return horizon, words
+    return None
 
 
 def _sign(found: Sequence[Change | None]) -> int:
@@ -251,9 +267,10 @@ def _added(before: ProgramScores, after: ProgramScores) -> str:
 
 
 def with_interval(value: float, interval: Sequence[float], digits: int, unit: str = "") -> str:
-    """A difference with its sign, and its interval."""
-    low, high = (f"{end:.{digits}f}" for end in interval)
-    return f"{value:+.{digits}f}{unit} [{low}, {high}]".replace("-", "−")
+    """A difference with its sign, and its interval; in powers of ten where a million is reached."""
+    kind = f".{digits}f" if max(map(abs, (value, *interval))) < MAX_PLAIN else ".1e"
+    low, high = (f"{end:{kind}}" for end in interval)
+    return f"{value:+{kind}}{unit} [{low}, {high}]".replace("-", "−")
 
 
 def _likelihood_cells(row: Mapping[str, Any], bands: Sequence[str]) -> list[str]:

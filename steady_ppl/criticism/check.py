@@ -47,6 +47,7 @@ MAX_ROWS_OF_DRAWS = 60_000  # rows times draws of the parameters, each of which 
 BANDS_HOLD = (
     "these drives are not those of the fit: bands hold what its own drives leave open of its parameters as well"
 )
+TAKEN_AS_EXACT = "parameters are taken as exact: the fit does not say how well its drives determine them"
 BANDS_HOLD_NOT = "parameters are taken as exact: within what the fit's drives leave open of them the program diverges"
 MAX_RESIDUAL_SD = 4.0  # of a single residual; beside a landmark the linearised program knows no more
 
@@ -131,6 +132,8 @@ def check(
         seen = len(known.drives.intersection(problem.data.digests))
         notes.append(BANDS_HOLD if is_open else BANDS_HOLD_NOT)
         notes += [f"{seen} of these drives are the fit's own, and count as others here"] if seen else []
+    elif known is None and not has_seen and fit.recipe != "hand":
+        notes.append(TAKEN_AS_EXACT)
     notes += fallback_notes(uncompiled) + run.uneven_steps + diagnose_units(program, run)
     notes += [outliers.note] if outliers.note else []
     notes += [f"refitted to these drives, {step.note}"] if step.note else []

@@ -42,10 +42,10 @@ def named_horizons(
         return {"one step": 1} | {name: ahead for name, ahead in rows.items() if 1 < ahead < data.time.shape[0]}
     found = {"one step": 1}
     for one in sorted(set(seconds)):
-        require(math.isfinite(one) and one > 0, "horizons", one, "seconds above zero")
+        require(math.isfinite(one) and one > 0, "horizon", one, "seconds above zero")
         ahead, longest = data.rows_ahead(one), (data.time.shape[0] - 1) * data.median_step
-        require(1 < ahead < data.time.shape[0], "horizons", one, f"{2 * data.median_step:.3g} to {longest:.3g} s")
-        require(ahead not in found.values(), "horizons", one, "times that are not the same number of rows")
+        require(1 < ahead < data.time.shape[0], "horizon", one, f"{2 * data.median_step:.3g} to {longest:.3g} s")
+        require(ahead not in found.values(), "horizon", one, "times that are not the same number of rows")
         found[f"{one:g} s"] = ahead
     return found
 

@@ -4,6 +4,7 @@ import copy
 import hashlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
@@ -26,6 +27,7 @@ from steady_ppl.effects.declaration import VERDICT_OF_FORM
 from steady_ppl.errors import DataError, FilterError, UsageError
 from steady_ppl.gaussian.linearize import require_linear
 from steady_ppl.kernels.rows import fallback_notes, kernel_failures
+from steady_ppl.likelihood.information import ParameterInformation, information_of_fit
 from steady_ppl.likelihood.outliers import find_outliers
 from steady_ppl.likelihood.parameters import elements
 from steady_ppl.model.problem import Problem
@@ -153,10 +155,9 @@ def discover(
     notes += fallback_notes(why) + diagnose_units(program, problem.data) + _notes(found) + (again or [])
     if proof is not None:
         notes += doubtful(proof.rows, judges)
-    said = {"simulations": simulations, "seed": seed}
-    trained = Trained([], kept=0, interrupted=True) if found.interrupted else None
+    drives = frozenset((*problem.data.digests, *choosing.data.digests))
     before, after = (
-        Fit(refit.mean_program(), "discover", said, seed, known_start, trained)
+        _fit_to_all(refit, found, drives, settings, notes)
         for refit in (found.as_it_stands, found.base if shape else found.final)
     )
     return Discovery(found, effects, shape, proposed, proof, before, after, _doubts(found, is_fitted), notes)
@@ -181,6 +182,24 @@ def _afterwards(compute: Callable[[], Later], found: Search, doing: str, notes: 
     except Exception as error:  # also of the program's own code; what was found stays
         notes.append(f"{doing} failed: {reason_of(error)}")
     return None
+
+
+def _fit_to_all(refit: Refit, found: Search, drives: frozenset[str], settings: Settings, notes: list[str]) -> Fit:
+    """The program fitted to all drives, which have these digests, with what they tell of its parameters."""
+    program, fold, maxima = refit.mean_program(), refit.folds[0], refit.judges.maxima
+    data = concatenated(train=fold.drives, valid=fold.held_out)
+    about = sum((one.information for one in maxima[1:]), maxima[0].information)
+
+    def known() -> ParameterInformation | None:
+        with seeded(settings.seed, "information"):
+            found, why = information_of_fit(Problem(program, data, fold.known_start).without_truth(), None, about)
+        notes.extend(why)
+        return None if found is None else replace(found, drives=drives)
+
+    information = _afterwards(known, found, "looking at what the drives tell of the parameters", notes)
+    said = {"simulations": settings.sets, "seed": settings.seed}
+    trained = Trained([], kept=0, interrupted=True) if found.interrupted else None
+    return Fit(program, "discover", said, settings.seed, fold.known_start, trained, information=information)
 
 
 def _proposed(largest: Found, seed: int, notes: list[str]) -> NextRun | None:

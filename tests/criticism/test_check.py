@@ -18,7 +18,7 @@ from small import finite
 import steady_ppl as st
 from steady_ppl import for_program
 from steady_ppl.criticism.baselines import ConstantVelocity, Reference, constant_velocity
-from steady_ppl.criticism.check import _in_own_spreads
+from steady_ppl.criticism.check import TAKEN_AS_EXACT, _in_own_spreads
 from steady_ppl.criticism.residual_maps import Residuals
 from steady_ppl.gaussian.kalman import track
 from steady_ppl.gaussian.linearize import ReferencePath
@@ -362,9 +362,11 @@ def test_what_a_fit_could_not_know_is_no_fault(off) -> None:
     fit, data = off
     sure = st.check(fit, data, simulations=40)
     assert sure.blame.kind == "parameters" and "fit it again first" in str(sure)
+    assert TAKEN_AS_EXACT in sure.notes
+    assert TAKEN_AS_EXACT not in st.check(replace(fit, recipe="hand"), data, simulations=20).notes  # nothing was fitted
     others = st.simulate(fit.program, 3, seed=9)
     open_ = st.check(known_by(fit, for_program(fit.program, others), 0.1), data, simulations=40)
-    assert open_.is_open and open_.blame.p_values["parameters"] > 0.05
+    assert open_.is_open and TAKEN_AS_EXACT not in open_.notes and open_.blame.p_values["parameters"] > 0.05
     assert open_.figures["parameter_uncertainty"] is True
     assert "noise and fit" in str(open_) and "bands hold what its own drives leave open" in str(open_)
     assert "noise alone" in str(sure) and "bands hold" not in str(sure)

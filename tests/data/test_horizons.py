@@ -54,7 +54,7 @@ def test_times_that_are_asked_for_come_first() -> None:
     assert named_horizons(waves(0.8, 0.1), 2, [2.5, 0.5]) == {"one step": 1, "0.5 s": 5, "2.5 s": 25}
     assert list(named_horizons(waves(0.8, 0.1), 3)) == ["one step", "1 s", "3 s", "10 s"]
     for wrong in (-1.0, math.inf, 0.1, 40.0):
-        with pytest.raises(UsageError, match="horizons"):
+        with pytest.raises(UsageError, match="horizon is"):
             named_horizons(waves(0.8, 0.1), 2, [wrong])
     with pytest.raises(UsageError, match="the same number of rows"):
         named_horizons(waves(0.8, 0.1), 2, [0.5, 0.52])

@@ -66,6 +66,21 @@ def clean() -> st.Discovery:
     return discovered()
 
 
+def test_what_it_fits_says_how_well_the_drives_tell_it(dragged, tmp_path):
+    train, valid = tables(with_effects(owner(), "quadratic_drag=0.05"))
+    for fit in (dragged.before, dragged.after):
+        known = fit.information
+        assert known is not None and known.suits(fit.program)
+        assert known.has_seen(st.for_program(fit.program, train)) and known.has_seen(st.for_program(fit.program, valid))
+        assert known.gain < 0.5  # nats: the mean of two folds' fits is nearly that to all of their drives
+    known = dragged.after.information
+    sd = known.matrix.inverse().diagonal().sqrt()[known.names.index("quadratic_drag")]
+    assert float(sd) == pytest.approx(dragged.findings[0].sd[0], rel=0.3)  # which is of a fit to each fold
+    dragged.after.save(tmp_path / "run")
+    again = st.Fit.load(tmp_path / "run").information
+    assert again is not None and torch.equal(again.matrix, known.matrix) and again.drives == known.drives
+
+
 def test_a_missing_drag_is_found_with_its_coefficient(dragged):
     assert dragged.verdict == "dynamics" and dragged.p_value < 0.05
     (finding,) = dragged.findings
