@@ -158,7 +158,7 @@ def _too_strong(program: Program, factor: float) -> Program:
     """The program with everything that it does `factor` times faster than the vehicle."""
     base = type(program)
 
-    class TooStrong(base):
+    class TooStrong(base):  # type: ignore[valid-type]
         def transition(self, state, control, time, step):
             return super().transition(state, control * factor, time, step)
 

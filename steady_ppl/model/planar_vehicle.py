@@ -1,8 +1,9 @@
 """Vehicles in the plane that see bearings to landmarks."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import lru_cache
+from typing import Any
 
 import pyro.distributions as dist
 import torch
@@ -21,6 +22,7 @@ class PlanarVehicle(Program):
 
     Attributes:
         landmarks: positions that bearings are measured to, m.
+        sensors: what it carries, of `steady_ppl.sensors`; its measurements and its `observe` are then theirs.
         bearing_sd: standard deviation of a bearing, rad; 5° unless a program says otherwise, or learns it.
         slips: whether the lateral velocity is free; False where the program takes it back, with the centripetal term
             that a turn needs: `a_lateral = −w / settling + v · yaw_rate`.
@@ -40,6 +42,7 @@ class PlanarVehicle(Program):
     derivatives = {"x": "vx", "y": "vy", "heading": "yaw_rate"}
     axes = {"translation": ("forward", "lateral"), "yaw": ("yaw",)}
     landmarks: Sequence[Sequence[float]] = ()
+    sensors: Sequence[Any] = ()
     bearing_sd: float
     settling: float | None = None
     slips: bool = True
@@ -51,13 +54,44 @@ class PlanarVehicle(Program):
 
     @property
     def measurements(self) -> tuple[str, ...]:  # type: ignore[override]
-        """One bearing a landmark."""
+        """The columns of its sensors; where it lists none, one bearing a landmark."""
+        if self.sensors:
+            return tuple(column for sensor in self.sensors for column in sensor.columns(self))
         return self._bearings
+
+    @property
+    def sensor_columns(self) -> Mapping[str, tuple[int, ...]]:
+        """Name of each sensor that it lists → its measurements' indices."""
+        found, begins = dict[str, tuple[int, ...]](), 0
+        for sensor in self.sensors:
+            ends = begins + len(sensor.columns(self))
+            found[sensor.name], begins = tuple(range(begins, ends)), ends
+        return found
+
+    def observe(self, state: Tensor) -> None:
+        """Sample what its sensors read; a vehicle that lists none has an `observe` of its own."""
+        if not self.sensors:
+            super().observe(state)
+        for sensor in self.sensors:
+            sensor.observe(self, state)
 
     @property
     def sees_bearings(self) -> bool:
         """Whether a bearing to each landmark, and nothing else, is measured."""
         return len(self.landmarks) > 0 and self.measurement_names == names(self._bearings)
+
+    @property
+    def landmark_columns(self) -> Mapping[str, tuple[int, ...]]:
+        """ "bearing" and "range" → the measurements `bearing_0 [rad]`, … or `range_0 [m]`, …, where there is one a
+        landmark, in order."""
+        declared = list(zip(self.measurement_names, self.measurement_units, strict=True))
+        found = {}
+        for kind, unit in (("bearing", "rad"), ("range", "m")):
+            wanted = [(f"{kind}_{index}", unit) for index in range(len(self.landmarks))]
+            begins = declared.index(wanted[0]) if wanted and wanted[0] in declared else 0
+            if wanted and declared[begins : begins + len(wanted)] == wanted:
+                found[kind] = tuple(range(begins, begins + len(wanted)))
+        return found
 
     @property
     def _bearings(self) -> tuple[str, ...]:

@@ -9,7 +9,14 @@ from torch import Tensor
 
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.effects.catalogue.forces import PLANAR
-from steady_ppl.effects.catalogue.sensors import BEARINGS
+from steady_ppl.effects.catalogue.sensors import (
+    LANDMARKS,
+    LISTED,
+    SEES_LANDMARKS,
+    Columns,
+    among,
+    each_sensor,
+)
 from steady_ppl.effects.catalogue.wheels import SPEED_AND_TURN
 from steady_ppl.effects.declaration import Choices, Effect, Names, Need, Pushes, declare, needs
 from steady_ppl.model.planar_vehicle import PlanarVehicle
@@ -30,7 +37,10 @@ def _groups(program: Program, data: Trajectories | None) -> Choices:
 
 
 def _quantities(program: Program, data: Trajectories | None) -> Choices:
-    """The measurements in one unit together, called by what their names have in common."""
+    """Each sensor that the program lists; without any the measurements in one unit together, called by what their names
+    have in common."""
+    if isinstance(program, PlanarVehicle) and program.sensors:
+        return each_sensor()(program, data)
     columns = defaultdict[str, list[int]](list)
     for index, unit in enumerate(program.measurement_units):
         columns[unit].append(index)
@@ -67,20 +77,38 @@ def measurement_noise(self: Program, state: Tensor, c: Tensor, columns: tuple[in
     feels: sees worse (or better) than its data sheet says
     occurs: a data sheet for other light, distance or temperature than the sensor has
     """
-    every = range(len(self.measurements))
-    among = torch.tensor([float(index in (columns or every)) for index in every]).to(c)
-    return (1 + (c - 1) * among).expand(*state.shape[:-1], len(every))
+    count = len(self.measurements)
+    return (1 + (c - 1) * among(columns, c.new_zeros(count))).expand(*state.shape[:-1], count)
 
 
-@_noise("blur", "1/m", typical=0.1, limit=1.0, sign=1, lacks=needs(PLANAR, BEARINGS))
-def range_dependent_noise(self: Program, state: Tensor, c: Tensor) -> Tensor:
+@_noise(
+    "blur", "1/m", typical=0.1, limit=1.0, sign=1, choices=each_sensor(*SEES_LANDMARKS), lacks=needs(PLANAR, LANDMARKS)
+)
+def range_dependent_noise(self: Program, state: Tensor, c: Tensor, columns: Columns = ()) -> Tensor:
     r"""σ → σ (1 + c r), r the distance
 
     equation: \sigma \to \sigma\,(1 + c\,r)
     feels: far landmarks are seen worse
     occurs: cameras (a pixel covers more), radios (less signal), stereo depth
     """
-    return (1 + c * self.ranges(state)).clamp(min=0.05)
+    away = self.ranges(state)
+    if columns:
+        left = [away.new_zeros(*away.shape[:-1], n) for n in (columns[0], len(self.measurements) - columns[-1] - 1)]
+        away = torch.cat([left[0], away, left[1]], -1)
+    return (1 + c * away).clamp(min=0.05)
+
+
+@_noise("blur", "s/m", typical=0.3, limit=5.0, sign=1, choices=each_sensor(), lacks=needs(LISTED))
+def speed_dependent_noise(self: Program, state: Tensor, c: Tensor, columns: Columns) -> Tensor:
+    r"""σ → σ (1 + c v), v the speed, one sensor
+
+    equation: \sigma \to \sigma\,(1 + c\,v)
+    feels: sees worse while it moves
+    occurs: cameras that blur, sensors that shake, wheels that skip
+    """
+    forward, lateral, _ = self.body_velocity(state)
+    speed = (forward.square() + lateral.square() + 1e-8).sqrt().unsqueeze(-1)
+    return (1 + c * speed * among(columns, state.new_zeros(len(self.measurements)))).clamp(min=0.05)
 
 
 @_noise("spread", "1", typical=2.0, limit=2.0, sign=1, null=1.0, choices=_groups, lacks=needs(CHANNELS))

@@ -1,5 +1,6 @@
 """What lies between the vehicle and its measurements."""
 
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from functools import partial
 from typing import Any
 
@@ -12,42 +13,112 @@ from steady_ppl.effects.declaration import Choices, Effect, Need, declare, needs
 from steady_ppl.model.planar_vehicle import PlanarVehicle
 from steady_ppl.model.program import Program
 
+SEES_LANDMARKS = ("bearing", "range")  # kinds of sensors
+SCALED = ("bearing", "range", "velocity", "wheel speed", "yaw rate")  # kinds whose readings may be too large
+
+
+def sensors_of(program: Program, *kinds: str) -> dict[str, tuple[int, ...]]:
+    """Name of each sensor of some kinds that a program lists, or of any kind → the columns of its readings.
+
+    Of a program that lists none and does not see bearings alone, those that are called as landmarks' are.
+    """
+    if not isinstance(program, PlanarVehicle) or (program.sees_bearings and not program.sensors):
+        return {}
+    if not program.sensors:
+        seen = program.landmark_columns
+        return {kind: seen[kind] for kind in seen if not kinds or kind in kinds}
+    columns = program.sensor_columns
+    return {one.name: columns[one.name] for one in program.sensors if not kinds or one.kind in kinds}
+
+
+def among(columns: tuple[int, ...], like: Tensor) -> Tensor:
+    """One in some columns and zero in the others, `(K,)`; ones where none is named."""
+    every = range(like.shape[-1])
+    return torch.tensor([float(index in (columns or every)) for index in every]).to(like)
+
+
+def each_sensor(*kinds: str) -> Callable[[Program, Trajectories | None], Choices]:
+    """Every sensor of some kinds, at its name; one choice for all readings of a program that lists no sensors."""
+
+    def choices(program: Program, data: Trajectories | None) -> Choices:
+        return [{"columns": columns, **at} for at, columns in _named(sensors_of(program, *kinds))] or [{}]
+
+    return choices
+
+
+def _named(sensors: Mapping[str, tuple[int, ...]]) -> Iterator[tuple[dict[str, str], tuple[int, ...]]]:
+    """Sensors' columns, and where an effect is at: the sensor's name, unless there is one only."""
+    for name, columns in sensors.items():
+        yield ({"at": name} if len(sensors) > 1 else {}), columns
+
+
 BEARINGS: Need = (
-    lambda program: program.sees_bearings,
+    lambda program: program.sees_bearings or sensors_of(program, "bearing"),
     "it acts on bearings to landmarks, and the program measures something else",
+)
+LANDMARKS: Need = (
+    lambda program: program.sees_bearings or sensors_of(program, *SEES_LANDMARKS),
+    "it acts on bearings or distances to landmarks, and the program measures something else",
 )
 TWO_LANDMARKS: Need = (lambda program: len(program.measurements) != 1, "there is one landmark: its bias is that of all")
 OTHER_SENSORS: Need = (
-    lambda program: not (isinstance(program, PlanarVehicle) and program.sees_bearings),
+    lambda program: not (isinstance(program, PlanarVehicle) and program.sees_bearings) and _others(program),
     "of bearings to landmarks it is bearing_bias or landmark_bias",
 )
-ONE_UNIT: Need = (lambda program: len(set(program.measurement_units)) == 1, "the measurements have different units")
+SAME_SENSOR: Need = (
+    lambda program: sensors_of(program, *SCALED) or len(set(program.measurement_units)) == 1,
+    "the measurements have different units, and no `sensors` are listed",
+)
+LISTED: Need = (
+    lambda program: isinstance(program, PlanarVehicle) and program.sensors,
+    "the program lists no `sensors`",
+)
+POSITION: Need = (lambda program: sensors_of(program, "position"), "no sensor of a position is listed (`sensors`)")
 RATES: Need = (
     lambda program: program.derivatives,
     "no state component is known to be the velocity of another (`motion`)",
 )
 
 
-def _each(program: Program, data: Trajectories | None) -> Choices:
-    return [{"component": index, "at": name} for index, name in enumerate(program.measurement_names)]
+def _others(program: Program) -> list[int]:
+    """The columns that are no bearings to landmarks."""
+    bearings = {index for columns in sensors_of(program, "bearing").values() for index in columns}
+    return [index for index in range(len(program.measurements)) if index not in bearings]
+
+
+def _one_by_one(program: Program, columns: Iterable[int]) -> Choices:
+    return [{"component": index, "at": program.measurement_names[index]} for index in columns]
+
+
+def _each_bearing(program: Program, data: Trajectories | None) -> Choices:
+    bearings = [index for columns in sensors_of(program, "bearing").values() for index in columns]
+    return _one_by_one(program, bearings or range(len(program.measurements)))
+
+
+def _each_other(program: Program, data: Trajectories | None) -> Choices:
+    """All distances of a sensor together, then each reading alone."""
+    ranges = [(name, columns) for name, columns in sensors_of(program, "range").items() if len(columns) > 1]
+    together = [{"component": columns[0], "columns": columns, "at": name} for name, columns in ranges]
+    return [*together, *_one_by_one(program, _others(program))]
 
 
 SENSORS: list[Effect] = []
 _on_readings = partial(declare, SENSORS, "measured")
+Columns = tuple[int, ...]  # of readings; all where none is named
 
 
-@_on_readings("rad", typical=0.035, limit=0.5, lacks=needs(PLANAR, BEARINGS))
-def bearing_bias(self: Program, state: Tensor, measured: Tensor, c: Tensor) -> Tensor:
+@_on_readings("rad", typical=0.035, limit=0.5, choices=each_sensor("bearing"), lacks=needs(PLANAR, BEARINGS))
+def bearing_bias(self: Program, state: Tensor, measured: Tensor, c: Tensor, columns: Columns = ()) -> Tensor:
     r"""y → y + c, every bearing
 
     equation: y \to y + c
     feels: the sensor is screwed on askew
     occurs: a camera or an antenna that is turned on its mount, a compass with a wrong declination
     """
-    return measured + c
+    return measured + (c * among(columns, measured) if columns else c)
 
 
-@_on_readings("rad", typical=0.06, limit=0.5, choices=_each, lacks=needs(PLANAR, TWO_LANDMARKS, BEARINGS))
+@_on_readings("rad", typical=0.06, limit=0.5, choices=_each_bearing, lacks=needs(PLANAR, TWO_LANDMARKS, BEARINGS))
 def landmark_bias(self: Program, state: Tensor, measured: Tensor, c: Tensor, component: Any) -> Tensor:
     r"""y_i → y_i + c, one landmark
 
@@ -55,29 +126,67 @@ def landmark_bias(self: Program, state: Tensor, measured: Tensor, c: Tensor, com
     feels: one landmark is not where the map has it
     occurs: a landmark that was surveyed badly or moved, one receiver of an array that is off
     """
-    return measured + c * torch.tensor([float(index == component) for index in range(measured.shape[-1])]).to(measured)
+    return measured + c * among((component,), measured)
 
 
-@_on_readings("of the measurement", typical=0.05, limit=1.0, choices=_each, lacks=needs(OTHER_SENSORS))
-def sensor_bias(self: Program, state: Tensor, measured: Tensor, c: Tensor, component: Any) -> Tensor:
-    r"""y_i → y_i + c, one measurement
+@_on_readings("of the measurement", typical=0.05, limit=1.0, choices=_each_other, lacks=needs(OTHER_SENSORS))
+def sensor_bias(
+    self: Program, state: Tensor, measured: Tensor, c: Tensor, component: Any, columns: Columns = ()
+) -> Tensor:
+    r"""y_i → y_i + c, one measurement, or all distances
 
     equation: y_i \to y_i + c
     feels: reads too much (or too little) by the same amount
     occurs: amplifiers and strain gauges after a change of temperature, a zero that was never set
     """
-    return landmark_bias(self, state, measured, c, component)
+    return measured + c * among(columns or (component,), measured)
 
 
-@_on_readings("1", typical=0.03, limit=0.3, lacks=needs(ONE_UNIT))
-def sensor_scale(self: Program, state: Tensor, measured: Tensor, c: Tensor) -> Tensor:
+@_on_readings("1", typical=0.03, limit=0.3, choices=each_sensor(*SCALED), lacks=needs(SAME_SENSOR))
+def sensor_scale(self: Program, state: Tensor, measured: Tensor, c: Tensor, columns: Columns = ()) -> Tensor:
     r"""y → (1 + c) y
 
     equation: y \to (1 + c)\,y
     feels: reads a few per cent too much, at any size
     occurs: a lens with a wrong focal length, a range finder with a wrong speed of sound
     """
-    return measured * (1 + c)
+    return measured * (1 + (c * among(columns, measured) if columns else c))
+
+
+@_on_readings(
+    "m",
+    typical=(0.3, 0.1),
+    limit=5.0,
+    components=("ahead", "left"),
+    choices=each_sensor("position"),
+    lacks=needs(POSITION),
+)
+def antenna_offset(self: Program, state: Tensor, measured: Tensor, c: Tensor, columns: Columns) -> Tensor:
+    r"""y → y + R(θ) c, one position
+
+    equation: y \to y + R(\theta)\,c
+    feels: the measured point swings around the vehicle in turns
+    occurs: a GPS antenna on the bow or the roof, a marker that is not above the axle
+    """
+    x, y = columns
+    cos, sin = state[..., 2:3].cos(), state[..., 2:3].sin()
+    ahead, left = c.unbind(-1)
+    moved = (cos * ahead - sin * left) * among((x,), measured) + (sin * ahead + cos * left) * among((y,), measured)
+    return measured + moved
+
+
+@_on_readings("s", typical=0.1, limit=1.0, choices=each_sensor(), lacks=needs(LISTED, RATES))
+def sensor_delay(self: Program, state: Tensor, measured: Tensor, c: Tensor, columns: Columns) -> Tensor:
+    r"""y(t) → y(t - c), one sensor
+
+    equation: y(t) \to y(t - c)
+    feels: one sensor shows where it was a moment ago
+    occurs: images that are processed before they are stamped, receivers that filter, messages that wait
+    """
+    (sensor,) = (one for one in self.sensors if self.sensor_columns[one.name] == columns)
+    change = sensor.reading(self, self.earlier(state, c)) - sensor.reading(self, state)
+    left = [change.new_zeros(*change.shape[:-1], count) for count in (columns[0], measured.shape[-1] - columns[-1] - 1)]
+    return measured + torch.cat([left[0], change, left[1]], -1)
 
 
 @declare(SENSORS, "viewpoint", "s", typical=0.12, limit=1.0, lacks=needs(RATES))

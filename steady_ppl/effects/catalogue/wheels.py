@@ -1,4 +1,4 @@
-"""Vehicles on wheels that are told a speed and a turn rate, as programs without slip have them."""
+"""Vehicles on wheels that are told a speed and a turn rate or a steering angle, as programs without slip have them."""
 
 import math
 from collections.abc import Callable
@@ -18,7 +18,20 @@ SPEED_AND_TURN: Need = (
     lambda program: {"speed", "turn"} <= set(program.control_names),
     "the controls are not a speed and a turn rate, which the state could be compared with",
 )
+STEERED: Need = (
+    lambda program: "speed" in program.control_names and _steering(program),
+    "the controls are not a speed and a turn rate or a steering angle",
+)
+STEERING_ANGLE: Need = (
+    lambda program: ("steering", "rad") in zip(program.control_names, program.control_units, strict=True),
+    "no control is a steering angle (`steering [rad]`)",
+)
 GRIP: Need = (lambda program: not program.slips, "the lateral velocity is free")
+
+
+def _steering(program: Program) -> tuple[str, ...]:
+    """The control that steers, if there is one."""
+    return tuple(name for name in ("turn", "steering") if name in program.control_names)[:1]
 
 
 def _each_channel(program: Program, data: Trajectories | None) -> Choices:
@@ -37,8 +50,9 @@ def _slow(speed: float) -> Callable[[Program, Trajectories | None], Choices]:
 
 WHEELS: list[Effect] = []
 _on_command = partial(declare, WHEELS, "command", lacks=needs(SPEED_AND_TURN, PLANAR))
+_on_steering = partial(declare, WHEELS, "command", lacks=needs(STEERED, PLANAR))
 _on_lateral_velocity = partial(declare, WHEELS, "push", lacks=needs(PLANAR, GRIP))
-_on_wheels = partial(declare, WHEELS, "push", lacks=needs(SPEED_AND_TURN, PLANAR, GRIP))
+_on_wheels = partial(declare, WHEELS, "push", lacks=needs(STEERED, PLANAR, GRIP))
 
 
 @_on_wheels(
@@ -83,28 +97,41 @@ def steering_offset(self: Program, state: Tensor, control: Tensor, time: Tensor,
     return control + (c * forward).unsqueeze(-1) * self.chosen_controls(("turn",), control)
 
 
-@_on_command("s²/m²", typical=0.02, limit=0.5)
+@declare(WHEELS, "command", "rad", typical=0.03, limit=0.3, name="steering_offset", lacks=needs(STEERING_ANGLE, PLANAR))
+def steering_angle_offset(self: Program, state: Tensor, control: Tensor, time: Tensor, c: Tensor) -> Tensor:
+    r"""steering → steering + c
+
+    equation: u_\mathrm{steering} \to u_\mathrm{steering} + c
+    feels: drives a curve with the steering straight
+    occurs: a steering sensor whose zero was never set, a wheel that is out of alignment
+    """
+    return control + c * self.chosen_controls(("steering",), control)
+
+
+@_on_steering("s²/m²", typical=0.02, limit=0.5)
 def understeer(self: Program, state: Tensor, control: Tensor, time: Tensor, c: Tensor) -> Tensor:
-    r"""turn → (1 - c v²) turn
+    r"""turn → (1 - c v²) turn, or the steering angle
 
     equation: u_\mathrm{turn} \to (1 - c\,v^2)\,u_\mathrm{turn}
     feels: fast curves are wider than slow ones
     occurs: cars whose front tyres slip more than their rear ones
     """
     forward, _, _ = self.body_velocity(state)
-    return control * (1 - (c * forward**2).unsqueeze(-1) * self.chosen_controls(("turn",), control))
+    return control * (1 - (c * forward**2).unsqueeze(-1) * self.chosen_controls(_steering(self), control))
 
 
-@_on_command("1", typical=0.1, limit=1.0, profiled=("knee",), by_factor=("knee",), choices=_slow(0.1))
+@_on_steering("1", typical=0.1, limit=1.0, profiled=("knee",), by_factor=("knee",), choices=_slow(0.1))
 def reverse_steering(self: Program, state: Tensor, control: Tensor, time: Tensor, c: Tensor, knee: Any) -> Tensor:
-    r"""turn → (1 - c tanh(v/knee)) turn
+    r"""turn → (1 - c tanh(v/knee)) turn, or the steering angle
 
     equation: u_\mathrm{turn} \to (1 - c\,\tanh(v / v_0))\,u_\mathrm{turn}
     feels: turns tighter backwards than forwards
     occurs: tyres, suspensions and differentials that are not alike in both directions
     """
     forward, _, _ = self.body_velocity(state)
-    return control * (1 - (c * torch.tanh(forward / knee)).unsqueeze(-1) * self.chosen_controls(("turn",), control))
+    return control * (
+        1 - (c * torch.tanh(forward / knee)).unsqueeze(-1) * self.chosen_controls(_steering(self), control)
+    )
 
 
 @_on_lateral_velocity("m", typical=0.1, limit=1.0)

@@ -1,0 +1,76 @@
+"""What every sensor is: columns of a table, and a distribution of its readings given the state."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import pyro
+import pyro.distributions as dist
+from torch import Tensor
+
+from steady_ppl.errors import ProgramError
+from steady_ppl.model.distributions import WrappedNormal
+from steady_ppl.model.handlers import unwrapped
+
+Setting = float | Sequence[float] | str
+"""A number, or the name of one of the program's parameters or constants, which may then be learned."""
+
+
+@dataclass(frozen=True)
+class Sensor(ABC):
+    """A sensor of a vehicle in the plane. A reading that is missing in a row is an empty cell of the table.
+
+    Attributes:
+        sd: standard deviation of a reading, in its unit.
+        name: of the sensor; its site's, and the beginning of its columns' names.
+    """
+
+    sd: Setting
+    name: str = ""
+
+    kind: ClassVar[str]  # what is measured
+    of_circle: ClassVar[bool] = False  # whether readings are angles
+
+    def __post_init__(self) -> None:
+        if not self.name:
+            object.__setattr__(self, "name", self.kind.replace(" ", "_"))
+        if not self.name.isidentifier():
+            raise ProgramError(f"a sensor's name is one word, got {self.name!r}", site="sensors")
+        if not isinstance(self.sd, str | Sequence) and not self.sd > 0:
+            raise ProgramError(f"sensor {self.name}: sd is above zero, got {self.sd}", site="sensors")
+
+    @abstractmethod
+    def columns(self, program: Any) -> tuple[str, ...]:
+        """Its `K` columns, as "name [unit]"."""
+
+    @abstractmethod
+    def reading(self, program: Any, state: Tensor) -> Tensor:
+        """What it would read without noise, `(..., K)`."""
+
+    def distribution(self, program: Any, state: Tensor) -> dist.Independent:
+        """Of its readings, `(..., K)`."""
+        kind = WrappedNormal if self.of_circle else dist.Normal
+        return kind(self.reading(program, state), setting(program, self.sd, state)).to_event(1)
+
+    def observe(self, program: Any, state: Tensor) -> None:
+        """Sample its readings at the site of its name."""
+        pyro.sample(self.name, self.distribution(program, state))
+
+
+def setting(program: Any, value: Setting, like: Tensor) -> Any:
+    """A setting's value for a program: a number, or a tensor like the states."""
+    if isinstance(value, str):
+        if not hasattr(program, value):
+            said = f"its sensor names {value!r}, which it does not have"
+            raise ProgramError(f"program {type(program).__name__}: {said}", site="sensors")
+        value = getattr(program, value)
+    return value if isinstance(value, float | int | Tensor) else like.new_tensor(value)
+
+
+def mean_of(fn: dist.Independent) -> Tensor:
+    """The mean of a distribution of readings, `(..., K)`; of angles, on the circle."""
+    base = unwrapped(fn)
+    return -base.residual(base.loc.new_zeros(())) if hasattr(base, "residual") else base.loc
