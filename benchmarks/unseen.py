@@ -38,7 +38,7 @@ RESULT = FOLDER / "results" / "unseen.jsonl"
 RECIPES = FOLDER.parent / "inference"
 ENGINE = digest(Path(steady_ppl.__file__).parent, RECIPES, files=[*SOURCES, *sorted(RECIPES.glob("*.py"))])
 HOVERCRAFT = "hovercraft paper x1 known"
-VEHICLES = {HOVERCRAFT: 4, "boat": 4, "cart": 2, "pendulum": 4}  # and the substeps at which their programs are right
+VEHICLES = {HOVERCRAFT: 4, "boat": 4, "cart": 2, "pendulum": 8}  # and the substeps at which their programs are right
 MULTIPLE = 2.0  # of the detection limit
 LEVEL, MIN_POWER, MIN_RIGHT = 0.05, 0.9, 0.85
 
