@@ -18,6 +18,7 @@ class Car(PlanarVehicle):
     a_lateral = −w / settling + v · yaw_rate
     a_yaw     = (v tan(steering) / wheelbase − yaw_rate) / settling
 
+    A step takes the mean of these exponential responses over itself.
     The tracked point is the middle of the rear axle; where the antenna is from there, m ahead and to the left, is
     learned.
     """
@@ -26,7 +27,7 @@ class Car(PlanarVehicle):
     sensors = (Position(sd=0.3, name="gps", offset="antenna"), YawRate(sd=0.02, name="gyro"))
     guesses = ("noise", "antenna")
     slips = False
-    substeps = 2
+    substeps = 4
     duration = 20.0
     settling = 0.1  # s
 
@@ -34,7 +35,7 @@ class Car(PlanarVehicle):
         super().__init__()
         self.wheelbase = PyroParam(tensor(2.8), constraints.positive)  # m
         self.antenna = PyroParam(tensor([1.0, 0.0]), constraints.real)  # m
-        self.noise = PyroParam(tensor([1.0, 0.5, 0.5]), constraints.positive)  # m/s², m/s², rad/s²
+        self.noise = PyroParam(tensor([2.0, 2.0, 1.0]), constraints.positive)  # m/s², m/s², rad/s²
 
     def initial(self):
         sd = tensor([3.0, 3.0, 3.0, 3.0, 3.0, 0.3]).to(self.noise)
@@ -43,10 +44,13 @@ class Car(PlanarVehicle):
     def transition(self, state, control, time, step):
         speed, steering = control.unbind(-1)
         forward, lateral, yaw_rate = self.body_velocity(state)
+        rate = (1 - (-step / self.settling).exp()) / step
+        halfway = forward + 0.5 * step * rate * (speed - forward)  # the speed in the middle of the step
+        turn = halfway * steering.tan() / self.wheelbase
         mean = stack(
-            (speed - forward) / self.settling - lateral * yaw_rate,
-            -lateral / self.settling + forward * yaw_rate,
-            (forward * steering.tan() / self.wheelbase - yaw_rate) / self.settling,
+            (speed - forward) * rate - lateral * yaw_rate,
+            -lateral * rate + halfway * (yaw_rate + 0.5 * step * rate * (turn - yaw_rate)),
+            (turn - yaw_rate) * rate,
         )
         acceleration = pyro.sample("acceleration", dist.Normal(mean, self.noise).to_event(1))
         return self.integrate(state, acceleration, step)

@@ -192,9 +192,9 @@ def _fit_to_all(refit: Refit, found: Search, drives: frozenset[str], settings: S
 
     def known() -> ParameterInformation | None:
         with seeded(settings.seed, "information"):
-            found, why = information_of_fit(Problem(program, data, fold.known_start).without_truth(), None, about)
-        notes.extend(why)
-        return None if found is None else replace(found, drives=drives)
+            kept, why = information_of_fit(Problem(program, data, fold.known_start).without_truth(), None, about)
+        notes.extend(note for note in why if note not in notes)
+        return None if kept is None else replace(kept, drives=drives)
 
     information = _afterwards(known, found, "looking at what the drives tell of the parameters", notes)
     said = {"simulations": settings.sets, "seed": settings.seed}

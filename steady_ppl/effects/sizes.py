@@ -127,7 +127,7 @@ class Sizes:
             at = [self.program.control_names.index(name) for name in variant.options["controls"]]
             return float(self.data.controls[..., at][self.data.rows].abs().amax())
         if effect.unit == "of the measurement":
-            at = variant.options["component"]
+            at = list(variant.options.get("columns") or [variant.options["component"]])
             seen = self.data.measurements[..., at][self.data.observed[..., at]].double()
             return float(seen.std()) if len(seen) > 1 else 1.0
         if self.data.states is None or effect.null not in (0.0, math.inf):
@@ -185,7 +185,13 @@ class Sizes:
 
     def _blur(self, variant: Variant) -> float:
         state = self._rows[0]
-        return self._until(variant, 1.0, lambda v: rms(v(self.program, state, c=v.coefficient(v.typical, state)) - 1))
+
+        def size(variant: Variant) -> float:
+            factors = variant(self.program, state, c=variant.coefficient(variant.typical, state))
+            columns = variant.options.get("columns") or range(factors.shape[-1])
+            return rms(factors[..., list(columns)] - 1)
+
+        return self._until(variant, 1.0, size)
 
     def _spread(self, variant: Variant) -> float:
         def size(variant: Variant) -> float:

@@ -33,6 +33,7 @@ MAX_INCREASE = 10.0
 """Nats by which a step may leave a path worse off, see `_merit`: some such steps lead out of a bad place."""
 MAX_RETURN = 0.5  # share of a whole step that the next may undo: where it undoes more, a path swings about its mode
 MIN_SHARE = 0.05  # of a step, to which it is shortened at most
+MAX_POORER, MORE_PARTICLES = 5.0, 8  # nats a reading that a drive is less likely than most; times as many then
 REST_TOLERANCE = 0.05  # a trajectory is at rest where no noise moves by more, in standard deviations of its channel
 
 
@@ -226,6 +227,7 @@ def find_path(
     Smooths from a path each of several bootstrap filters, whose start comes from the program's prior and the first
     measurements, and takes the one under which the measurements are most likely. The filters trust the measurements
     less and less: from a broad prior sharp measurements leave a single root, often metres off, and all draws with it.
+    Drives that are much less likely than the others, reading by reading, are searched again with more particles.
 
     Args:
         particles: of each filter, for each trajectory.
@@ -234,6 +236,22 @@ def find_path(
     Raises:
         FilterError: a bootstrap filter broke down.
     """
+    search = partial(_most_likely_path, observation_weight=observation_weight, tempering=tempering, passes=passes)
+    path, likely = search(problem, particles=particles)
+    a_reading = likely / problem.data.observed.sum((0, 2)).clamp(min=1)
+    poor = a_reading < a_reading.median() - observation_weight * MAX_POORER
+    if bool(poor.any()):
+        index = poor.nonzero().flatten()
+        again, found = search(problem.subset(index), particles=MORE_PARTICLES * particles)
+        better = torch.zeros_like(poor).index_put((index,), found > likely[index])
+        path = _either(better, again.subset(poor.cumsum(0).clamp(min=1) - 1), path)
+    return path
+
+
+def _most_likely_path(
+    problem: Problem, *, observation_weight: float, particles: int, tempering: Sequence[float], passes: int
+) -> tuple[ReferencePath, Tensor]:
+    """A path of each drive, of those that the filters lead to, and log p(y) along it, `(B,)`."""
     program, data, known_start = problem.program, problem.data, problem.known_start
     copies = problem.subset(torch.arange(len(data)).repeat(len(tempering)))
     weights = observation_weight * data.controls.new_tensor(tempering).repeat_interleave(len(data))
@@ -243,7 +261,8 @@ def find_path(
     ahead = smooth(copies, path, observation_weight=observation_weight, passes=passes)
     likely = torch.nan_to_num(ahead.log_likelihood, nan=-torch.inf).view(len(tempering), len(data))
     chosen = likely.argmax(0) * len(data) + torch.arange(len(data), device=likely.device)
-    return ahead.linearization.path.subset(chosen)  # whose likelihood is known; a step further may be too far
+    # their likelihood is known; a step further may be too far
+    return ahead.linearization.path.subset(chosen), likely.amax(0)
 
 
 @torch.no_grad()

@@ -1,4 +1,4 @@
-"""Vehicles in the plane that see bearings to landmarks."""
+"""Vehicles in the plane: their state, their step, and the sensors that they list."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -14,6 +14,9 @@ from steady_ppl.errors import ProgramError, UsageError
 from steady_ppl.model.distributions import WrappedNormal
 from steady_ppl.model.program import Program, names
 
+NEAREST = 1e-6  # m, that a landmark is away at least, so that its distance has a slope
+LANDMARK_UNITS = {"bearing": "rad", "range": "m"}  # of measurements that are called so, one a landmark
+
 
 class PlanarVehicle(Program):
     """A vehicle with state (x, y, heading, vx, vy, yaw_rate): pose and velocity in the world frame.
@@ -21,7 +24,7 @@ class PlanarVehicle(Program):
     A subclass samples the body-frame accelerations and returns `self.integrate(state, acceleration, step)`.
 
     Attributes:
-        landmarks: positions that bearings are measured to, m.
+        landmarks: positions that bearings and ranges are measured to, m.
         sensors: what it carries, of `steady_ppl.sensors`; its measurements and its `observe` are then theirs.
         bearing_sd: standard deviation of a bearing, rad; 5° unless a program says otherwise, or learns it.
         slips: whether the lateral velocity is free; False where the program takes it back, with the centripetal term
@@ -56,24 +59,40 @@ class PlanarVehicle(Program):
     def measurements(self) -> tuple[str, ...]:  # type: ignore[override]
         """The columns of its sensors; where it lists none, one bearing a landmark."""
         if self.sensors:
-            return tuple(column for sensor in self.sensors for column in sensor.columns(self))
+            return tuple(column for sensor in self._listed for column in sensor.columns(self))
         return self._bearings
 
     @property
     def sensor_columns(self) -> Mapping[str, tuple[int, ...]]:
-        """Name of each sensor that it lists → its measurements' indices."""
-        found, begins = dict[str, tuple[int, ...]](), 0
-        for sensor in self.sensors:
-            ends = begins + len(sensor.columns(self))
-            found[sensor.name], begins = tuple(range(begins, ends)), ends
-        return found
+        """Name of each sensor that it lists → its measurements' indices; a vehicle whose own `observe` leaves some of
+        them out does not carry these."""
+        return self._places({sensor.name: names(sensor.columns(self)) for sensor in self._listed})
 
     def observe(self, state: Tensor) -> None:
         """Sample what its sensors read; a vehicle that lists none has an `observe` of its own."""
         if not self.sensors:
             super().observe(state)
-        for sensor in self.sensors:
+        for sensor in self._listed:
             sensor.observe(self, state)
+
+    @property
+    def _listed(self) -> Sequence[Any]:
+        """Its sensors; ProgramError where something else is listed."""
+        sensors = self.sensors if isinstance(self.sensors, Sequence) else [self.sensors]
+        wrong = [one for one in sensors if isinstance(one, type) or not hasattr(one, "observe")]
+        if wrong or not isinstance(self.sensors, Sequence):
+            about = f"`sensors` is a list of sensors, as `(Ranges(sd=0.1),)`, got {(wrong or [self.sensors])[0]!r}"
+            raise ProgramError(f"program {type(self).__name__}: {about}", site="sensors")
+        return sensors
+
+    def _places(self, columns: Mapping[str, Sequence[str]]) -> dict[str, tuple[int, ...]]:
+        """The indices of measurements by their names, of those that stand side by side."""
+        measured, found = list(self.measurement_names), {}
+        for name, wanted in columns.items():
+            begins = measured.index(wanted[0]) if wanted and wanted[0] in measured else 0
+            if wanted and measured[begins : begins + len(wanted)] == list(wanted):
+                found[name] = tuple(range(begins, begins + len(wanted)))
+        return found
 
     @property
     def sees_bearings(self) -> bool:
@@ -84,14 +103,8 @@ class PlanarVehicle(Program):
     def landmark_columns(self) -> Mapping[str, tuple[int, ...]]:
         """ "bearing" and "range" → the measurements `bearing_0 [rad]`, … or `range_0 [m]`, …, where there is one a
         landmark, in order."""
-        declared = list(zip(self.measurement_names, self.measurement_units, strict=True))
-        found = {}
-        for kind, unit in (("bearing", "rad"), ("range", "m")):
-            wanted = [(f"{kind}_{index}", unit) for index in range(len(self.landmarks))]
-            begins = declared.index(wanted[0]) if wanted and wanted[0] in declared else 0
-            if wanted and declared[begins : begins + len(wanted)] == wanted:
-                found[kind] = tuple(range(begins, begins + len(wanted)))
-        return found
+        found = self._places({kind: [f"{kind}_{i}" for i in range(len(self.landmarks))] for kind in LANDMARK_UNITS})
+        return {kind: at for kind, at in found.items() if self.measurement_units[at[0]] == LANDMARK_UNITS[kind]}
 
     @property
     def _bearings(self) -> tuple[str, ...]:
@@ -153,7 +166,15 @@ class PlanarVehicle(Program):
     def ranges(self, state: Tensor) -> Tensor:
         """Distances from the landmarks, `(..., K)` m."""
         places = _on_device(self.landmarks, state)
-        return (places - state[..., None, :2]).square().sum(-1).sqrt()
+        return ((places - state[..., None, :2]).square().sum(-1) + NEAREST**2).sqrt()
+
+    def earlier(self, state: Tensor, ago: Tensor) -> Tensor:
+        """The state `ago` seconds before, `(..., D)`, in a steady curve: the velocity turns with the heading."""
+        moved = super().earlier(state, ago)
+        turn = -ago * state[..., 5]
+        cos, sin, vx, vy = turn.cos(), turn.sin(), state[..., 3], state[..., 4]
+        turned = torch.stack([cos * vx - sin * vy, sin * vx + cos * vy], -1)
+        return torch.cat([moved[..., :3], turned, moved[..., 5:]], -1)
 
 
 def stack(*components: Tensor) -> Tensor:
@@ -238,8 +259,8 @@ class UnknownMap(PlanarVehicle):
     """A vehicle whose landmarks are not where they were declared: they are learned together with its dynamics.
 
     It is put before a vehicle that declares them: `class Mine(UnknownMap, Hovercraft)`. Bearings alone leave the frame
-    open: a map is learned only with known starts, with two `surveyed` landmarks, or relative to where drives begin
-    (`framed_by_start`), which is worth as much as `initial` is narrow.
+    open: a map is learned only with known starts, with two `surveyed` landmarks, with a listed sensor of the position,
+    or relative to where drives begin (`framed_by_start`), which is worth as much as `initial` is narrow.
 
     Attributes:
         surveyed: which landmarks are where they are declared, by index.
@@ -281,10 +302,11 @@ class UnknownMap(PlanarVehicle):
 
     def prepare(self, data: Trajectories, known_start: bool) -> None:
         """Refuse, by UsageError, to learn a map whose frame nothing fixes."""
-        if not (known_start or self.surveyed_frame or self.framed_by_start):
+        sees_position = any(sensor.kind == "position" for sensor in self._listed)
+        if not (known_start or self.surveyed_frame or self.framed_by_start or sees_position):
             raise UsageError(
                 f"program {type(self).__name__}: nothing fixes the frame of its map: give known starts "
-                "(--known-start), name two landmarks that are `surveyed`, or set `framed_by_start = True` where "
-                "`initial` is narrow"
+                "(--known-start), name two landmarks that are `surveyed`, list a sensor of the position, or set "
+                "`framed_by_start = True` where `initial` is narrow"
             )
         super().prepare(data, known_start)

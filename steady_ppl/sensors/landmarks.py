@@ -1,22 +1,31 @@
 """Sensors that see landmarks, each of them or some in a row."""
 
-from typing import Any
+from typing import Any, ClassVar
 
 import pyro.distributions as dist
 from torch import Tensor
 
+from steady_ppl.errors import ProgramError
 from steady_ppl.model.planar_vehicle import bearings_to
 from steady_ppl.sensors.sensor import Sensor, mean_of, setting
 
 
-class Bearings(Sensor):
+class _OfLandmarks(Sensor):
+    unit: ClassVar[str]
+
+    def columns(self, program: Any) -> tuple[str, ...]:
+        if not len(program.landmarks):
+            about = f"its sensor {self.name} needs `landmarks`, and it has none"
+            raise ProgramError(f"program {type(program).__name__}: {about}", site="sensors")
+        return tuple(f"{self.name}_{index} [{self.unit}]" for index in range(len(program.landmarks)))
+
+
+class Bearings(_OfLandmarks):
     """The bearing of each of the program's landmarks against its heading, rad anticlockwise."""
 
     kind = "bearing"
+    unit = "rad"
     of_circle = True
-
-    def columns(self, program: Any) -> tuple[str, ...]:
-        return tuple(f"{self.name}_{index} [rad]" for index in range(len(program.landmarks)))
 
     def reading(self, program: Any, state: Tensor) -> Tensor:
         return mean_of(self.distribution(program, state))
@@ -25,13 +34,11 @@ class Bearings(Sensor):
         return bearings_to(program.landmarks, state, sd=setting(program, self.sd, state))
 
 
-class Ranges(Sensor):
+class Ranges(_OfLandmarks):
     """The distance of each of the program's landmarks, m."""
 
     kind = "range"
-
-    def columns(self, program: Any) -> tuple[str, ...]:
-        return tuple(f"{self.name}_{index} [m]" for index in range(len(program.landmarks)))
+    unit = "m"
 
     def reading(self, program: Any, state: Tensor) -> Tensor:
         return program.ranges(state)

@@ -1,11 +1,13 @@
 """Sensors that measure the vehicle itself: where it is, where it points, how fast it moves and turns."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 from torch import Tensor
 
+from steady_ppl.errors import ProgramError
 from steady_ppl.model.planar_vehicle import stack
 from steady_ppl.sensors.sensor import Sensor, Setting, setting
 
@@ -21,6 +23,13 @@ class Position(Sensor):
     offset: Setting | None = None
 
     kind = "position"
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        is_pair = isinstance(self.offset, Sequence) and len(self.offset) == 2
+        if not (self.offset is None or isinstance(self.offset, str) or is_pair):
+            what = f"offset is two numbers, m ahead and to the left, got {self.offset!r}"
+            raise ProgramError(f"sensor {self.name}: {what}", site="sensors")
 
     def columns(self, program: Any) -> tuple[str, ...]:
         return f"{self.name}_x [m]", f"{self.name}_y [m]"
@@ -92,6 +101,10 @@ class WheelSpeed(Sensor):
     size: Setting = 1.0
 
     kind = "wheel speed"
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self._require_positive("size")
 
     def columns(self, program: Any) -> tuple[str, ...]:
         return (f"{self.name} [m/s]",)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -37,10 +38,16 @@ class Sensor(ABC):
     def __post_init__(self) -> None:
         if not self.name:
             object.__setattr__(self, "name", self.kind.replace(" ", "_"))
-        if not self.name.isidentifier():
+        if not (isinstance(self.name, str) and self.name.isidentifier()):
             raise ProgramError(f"a sensor's name is one word, got {self.name!r}", site="sensors")
-        if not isinstance(self.sd, str | Sequence) and not self.sd > 0:
-            raise ProgramError(f"sensor {self.name}: sd is above zero, got {self.sd}", site="sensors")
+        self._require_positive("sd")
+
+    def _require_positive(self, what: str) -> None:
+        value = getattr(self, what)
+        numbers = value if isinstance(value, Sequence) else (value,)
+        if isinstance(value, str) or all(isinstance(one, float | int) and 0 < one < math.inf for one in numbers):
+            return
+        raise ProgramError(f"sensor {self.name}: {what} is a number above zero, got {value!r}", site="sensors")
 
     @abstractmethod
     def columns(self, program: Any) -> tuple[str, ...]:

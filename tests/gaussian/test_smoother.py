@@ -14,6 +14,7 @@ from oracles import CartPosterior, cart_parameters
 from paths import anywhere, at_its_mode, near_the_truth
 
 from steady_ppl import for_program, seeded, simulate
+from steady_ppl.gaussian import smoother
 from steady_ppl.gaussian.linearize import ReferencePath
 from steady_ppl.gaussian.smoother import _penalty, find_and_smooth, find_path, smooth
 from steady_ppl.likelihood.evidence import neglected
@@ -171,3 +172,29 @@ def test_a_defects_price_is_twice_the_pull_of_all_measurements(uneven, cart):
     now = torch.einsum("tbkd,tbk->tbd", linear.measurement, linear.precision * apart)
     later = ahead.information - torch.einsum("tbde,tbe->tbd", ahead.precision, away)
     torch.testing.assert_close(_penalty(ahead, moved), 2 * (now + later).abs())
+
+
+def test_a_drive_whose_path_ended_far_off_is_searched_again(monkeypatch) -> None:
+    """Filters of a boat that begins anywhere led one drive of eight hundred to a wrong heading."""
+    boat = example("gps_boat", torch.float32)
+    boat.duration = 3.0
+    problem = Problem(boat, for_program(boat, simulate(boat, 5, seed=5)), False)
+    with seeded(0):
+        right = find_path(problem)
+    found, asked = smoother._most_likely_path, []
+
+    def astray(problem, **given):
+        asked.append((len(problem.data), given["particles"]))
+        path, likely = found(problem, **given)
+        if len(asked) > 1:
+            return path, likely
+        off = torch.arange(5) == 3
+        return replace(path, states=torch.where(off[:, None], path.states + 1.0, path.states)), likely - 1e5 * off
+
+    monkeypatch.setattr(smoother, "_most_likely_path", astray)
+    with seeded(0):
+        again = find_path(problem)
+    assert asked == [(5, 250), (1, 250 * smoother.MORE_PARTICLES)]
+    others = [0, 1, 2, 4]
+    assert torch.equal(again.states[:, others], right.states[:, others])
+    assert torch.allclose(again.states[:, 3], right.states[:, 3], atol=0.05)

@@ -31,6 +31,8 @@ PROGRAMS = (
     "neural_vehicle:NeuralHovercraft",
     "neural_vehicle:NeuralTruck",
     "hovercraft_unknown_map",
+    "unicycle",
+    "car",
 )
 # times a program's substeps that an effect of typical size takes: its force is that at a step's beginning
 MORE: dict[str, dict[str, int]] = {
@@ -41,8 +43,15 @@ MORE: dict[str, dict[str, int]] = {
     | {"coulomb_friction": 2, "wind": 16, "magnus": 32, "weathervane": 32},
     "truck": {},
     "discovered_truck": {"actuator_lag": 2},
+    "unicycle": {"yaw_quadratic_drag": 2, "response_time": 4, "curvature_steering": 2, "lever_arm": 4}
+    | {"crab_angle": 2, "slip_angle": 2, "caster": 4},
+    "car": {"quadratic_drag": 2, "yaw_quadratic_drag": 2, "acceleration_limit": 16, "response_time": 4}
+    | {"crab_angle": 2, "slip_angle": 4, "caster": 8, "speed_dependent_gain": 2},
 }
-BOUNDLESS = {("discovered_truck", "command_noise")}  # at twice the speeds its noise feeds itself
+BOUNDLESS = {  # at twice the speeds
+    ("discovered_truck", "command_noise"),  # its noise feeds itself
+    ("car", "understeer"),  # it steers to the other side
+}
 EFFECTS = [
     (name, effect.name) for name in MORE for effect in catalogue(example(name)) if (name, effect.name) not in BOUNDLESS
 ]
@@ -62,7 +71,7 @@ def ends(program, state, data, rows, count, handler=None, draws=1):
 def worst(program, factors: tuple[int, ...] = (1, 2, 4), drives: int = 6) -> float:
     """The largest share of the noise's spread by which roll-outs at K, 2 K … substeps differ."""
     data = for_program(program, simulate(program, drives, seed=1))
-    if {"speed", "turn"} <= set(program.control_names):  # what is commanded in speeds drives twice as fast
+    if "speed" in program.control_names:  # what is commanded in speeds drives twice as fast
         data.controls.mul_(2)
     count = round(1 / program.step)
     rows = torch.arange(0, len(data.steps) - count + 1, EVERY)

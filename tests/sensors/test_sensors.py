@@ -18,7 +18,8 @@ import steady_ppl as st
 from steady_ppl.effects import catalogue, chosen_variant
 from steady_ppl.model.handlers import Recording, running
 from steady_ppl.model.validate import probe
-from steady_ppl.sensors import BodyVelocity, Heading, Position, WheelSpeed, YawRate
+from steady_ppl.runs.recipes import find_recipe
+from steady_ppl.sensors import BodyVelocity, Heading, Position, Ranges, WheelSpeed, YawRate
 
 Unicycle = type(st.load_program(MODELS / "unicycle.py"))
 Car = type(st.load_program(MODELS / "car.py"))
@@ -30,6 +31,7 @@ class Carrying(Unicycle):
     sensors = (
         *Unicycle.sensors,
         Position(sd="gps_sd", name="gps", offset="antenna"),
+        Position(sd=0.2, name="tag", offset=(0.1, 0.2)),
         Heading(sd=0.05, name="compass", from_north=True),
         BodyVelocity(sd=0.1, name="log"),
         WheelSpeed(sd=0.05, name="wheel", left=0.3, size=1.1),
@@ -58,6 +60,7 @@ def test_each_reads_what_geometry_says() -> None:
     place, ahead = x + 1j * y, np.exp(1j * heading)
     towards = np.array([complex(*at) for at in program.landmarks])[:, None] - place
     antenna = place + ahead * (0.5 - 0.2j)
+    tag = place + ahead * (0.1 + 0.2j)
     body = (vx + 1j * vy) / ahead
     expected = [
         *abs(towards),
@@ -65,6 +68,8 @@ def test_each_reads_what_geometry_says() -> None:
         yaw_rate,
         antenna.real,
         antenna.imag,
+        tag.real,
+        tag.imag,
         math.pi / 2 - heading,
         body.real,
         body.imag,
@@ -83,12 +88,14 @@ def test_columns_are_called_after_the_sensor() -> None:
         "gyro [rad/s]",
         "gps_x [m]",
         "gps_y [m]",
+        "tag_x [m]",
+        "tag_y [m]",
         "compass [rad]",
         "log_forward [m/s]",
         "log_lateral [m/s]",
         "wheel [m/s]",
     )
-    assert program.sensor_columns["bearing"] == (4, 5, 6, 7) and program.sensor_columns["wheel"] == (14,)
+    assert program.sensor_columns["bearing"] == (4, 5, 6, 7) and program.sensor_columns["wheel"] == (16,)
     probe(program)
     data = st.simulate(program, 3, seed=1)
     assert data.measurement_names == program.measurement_names
@@ -109,7 +116,12 @@ def test_a_vehicle_without_a_list_has_an_observe_of_its_own() -> None:
 @pytest.mark.parametrize(
     ("make", "match"),
     [
-        (lambda: YawRate(sd=0.0), "sd is above zero, got 0.0"),
+        (lambda: YawRate(sd=0.0), "sensor yaw_rate: sd is a number above zero, got 0.0"),
+        (lambda: YawRate(sd=math.inf), "sd is a number above zero, got inf"),
+        (lambda: YawRate(sd=None), "sd is a number above zero, got None"),
+        (lambda: YawRate(sd=0.1, name=3), "a sensor's name is one word, got 3"),
+        (lambda: WheelSpeed(sd=0.1, size=0), "sensor wheel_speed: size is a number above zero, got 0"),
+        (lambda: Position(sd=0.1, offset=1.0), "offset is two numbers, m ahead and to the left, got 1.0"),
         (lambda: YawRate(sd=0.1, name="two words"), "a sensor's name is one word, got 'two words'"),
     ],
 )
@@ -132,6 +144,59 @@ def test_what_a_sensor_names_must_be_there_and_names_must_differ() -> None:
         probe(Twice())
 
 
+@pytest.mark.parametrize("listed", [Ranges(sd=0.1), (Ranges,), ("range",)])
+def test_what_is_no_list_of_sensors_is_refused(listed) -> None:
+    class Wrong(Unicycle):
+        sensors = listed
+
+    with pytest.raises(st.ProgramError, match=r"`sensors` is a list of sensors, as `\(Ranges\(sd=0.1\),\)`, got"):
+        probe(Wrong())
+
+
+def test_landmarks_are_needed_where_they_are_seen() -> None:
+    class Lost(Unicycle):
+        landmarks = ()
+
+    with pytest.raises(st.ProgramError, match="its sensor range needs `landmarks`, and it has none"):
+        probe(Lost())
+
+
+class Diver(Unicycle):
+    """Its depth is sampled first, the listed sensors after it."""
+
+    @property
+    def measurements(self):
+        return ("depth [m]", *super().measurements)
+
+    def observe(self, state):
+        pyro.sample("depth", dist.Normal(0.0 * state[..., :1], 0.1).to_event(1))
+        super().observe(state)
+
+
+def test_lines_of_ones_own_stand_beside_the_list() -> None:
+    program = Diver()
+    probe(program)
+    assert program.sensor_columns["range"] == (1, 2, 3, 4) and program.sensor_columns["gyro"] == (9,)
+    scale = moved(program.double(), "sensor_scale", 0.02, at="range")
+    assert not scale[:, [0, *range(5, 10)]].any() and bool((scale[:, 1:5] > 0).all())
+    assert variants(program)["measurement_noise"][-1] == "measurement_noise:depth"
+
+
+def test_sensors_that_an_own_observe_leaves_out_are_not_carried() -> None:
+    class Own(Unicycle):
+        measurements = ("depth [m]",)
+
+        def observe(self, state):
+            pyro.sample("depth", dist.Normal(0.0 * state[..., :1], 0.1).to_event(1))
+
+    program = Own()
+    probe(program)
+    assert program.sensor_columns == {} and "sensor_delay" not in variants(program)
+    assert variants(program)["sensor_bias"] == ["sensor_bias:depth"]
+    with pytest.raises(st.UsageError, match="the program lists no `sensors`"):
+        chosen_variant(program, "sensor_delay")
+
+
 def variants(program) -> dict[str, list[str]]:
     return {effect.name: [one.name for one in effect.variants(program)] for effect in catalogue(program)}
 
@@ -140,14 +205,35 @@ def test_effects_follow_from_what_is_listed() -> None:
     found = variants(Carrying())
     assert found["bearing_bias"] == ["bearing_bias"]
     assert found["landmark_bias"] == [f"landmark_bias:bearing_{i}" for i in range(4)]
-    assert found["sensor_bias"][:2] == ["sensor_bias:range", "sensor_bias:range_0"]
+    assert found["sensor_bias"][0] == "sensor_bias:range_0" and found["sensor_bias"][-1] == "sensor_bias:range"
     assert "sensor_bias:compass" in found["sensor_bias"] and "sensor_bias:bearing_0" not in found["sensor_bias"]
     assert found["sensor_scale"] == [f"sensor_scale:{name}" for name in ("range", "bearing", "gyro", "log", "wheel")]
     assert found["range_dependent_noise"] == ["range_dependent_noise:range", "range_dependent_noise:bearing"]
-    assert found["antenna_offset"] == ["antenna_offset"]
-    names = ["range", "bearing", "gyro", "gps", "compass", "log", "wheel"]
-    for effect in ("sensor_delay", "speed_dependent_noise", "measurement_noise"):
+    assert found["antenna_offset"] == ["antenna_offset"]  # of the tag: that of the GPS is learned
+    assert found["sensor_delay"] == [f"sensor_delay:{name}" for name in ("range", "bearing", "gps", "tag", "compass")]
+    names = ["range", "bearing", "gyro", "gps", "tag", "compass", "log", "wheel"]
+    for effect in ("speed_dependent_noise", "measurement_noise"):
         assert found[effect] == [f"{effect}:{name}" for name in names]
+
+    class Placed(Unicycle):
+        sensors = (Position(sd=0.1), Heading(sd=0.1))
+
+    with pytest.raises(st.UsageError, match="of positions and headings no size is measured"):
+        chosen_variant(Placed(), "sensor_scale")
+    assert "landmark_bias" not in variants(Placed()) and "antenna_offset" in variants(Placed())
+
+
+def test_a_map_is_framed_by_a_position() -> None:
+    class Mapping(st.UnknownMap, Carrying):
+        pass
+
+    class Blind(st.UnknownMap, Unicycle):
+        pass
+
+    data = st.simulate(Carrying(), 2, seed=1)
+    Mapping().prepare(data, known_start=False)
+    with pytest.raises(st.UsageError, match="list a sensor of the position"):
+        Blind().prepare(data, known_start=False)
 
 
 def test_a_vehicle_that_writes_its_own_lines_has_the_effects_of_landmarks_by_its_columns_names() -> None:
@@ -163,6 +249,8 @@ def test_a_vehicle_that_writes_its_own_lines_has_the_effects_of_landmarks_by_its
     probe(program)
     found = variants(program)
     assert found["bearing_bias"] == ["bearing_bias"] and found["sensor_scale"][0] == "sensor_scale:bearing"
+    places = [f"range_{i}" for i in range(4)] + [f"bearing_{i}" for i in range(4)] + ["range"]
+    assert found["sensor_bias"] == [f"sensor_bias:{at}" for at in places] and "landmark_bias" not in found
     assert set(found["range_dependent_noise"]) == {"range_dependent_noise:range", "range_dependent_noise:bearing"}
     assert "sensor_delay" not in found
 
@@ -192,11 +280,9 @@ def test_an_effect_of_a_sensor_leaves_the_others_alone() -> None:
     scale = only(moved(program, "sensor_scale", 0.02, at="range"), "range")
     assert torch.allclose(scale, 0.02 * program.ranges(state))
     assert torch.allclose(only(moved(program, "sensor_bias", 0.3, at="range"), "range"), tensor(0.3).double())
-    offset = only(moved(program, "antenna_offset", (1.0, 0.5)), "gps")
+    offset = only(moved(program, "antenna_offset", (1.0, 0.5)), "tag")
     ahead = torch.polar(torch.ones(len(state)).double(), state[:, 2]) * complex(1.0, 0.5)
     assert torch.allclose(offset, torch.stack([ahead.real, ahead.imag], -1))
-    late = only(moved(program, "sensor_delay", 0.2, at="gyro"), "gyro")
-    assert torch.allclose(late, torch.zeros_like(late))  # a yaw rate is taken to be what it was
     late = only(moved(program, "sensor_delay", 0.2, at="range"), "range")
     before = program.earlier(state, tensor(0.2))
     assert torch.allclose(late, program.ranges(before) - program.ranges(state))
@@ -250,8 +336,25 @@ def test_an_antenna_that_is_learned_is_found() -> None:
     car.antenna = tensor([3.6, -0.3])
     car.duration = 40.0
     data = st.simulate(car, 6, seed=3)
-    fit = st.find_recipe("likelihood")(Car(), data, known_start=True, seed=0)
+    fit = find_recipe("likelihood")(Car(), data, known_start=True, seed=0)
     found = fit.program.antenna.detach()
     sd = fit.information.matrix.inverse().diagonal().sqrt()
     index = [fit.information.names.index(name) for name in fit.information.names if name.startswith("antenna")]
     assert bool(((found - tensor([3.6, -0.3])).abs() < 4 * sd[index]).all()) and bool((sd[index] < 0.2).all())
+
+
+def test_a_moment_ago_in_a_steady_curve_is_on_the_curve() -> None:
+    speed, turn, ago = 3.0, 0.5, 0.2
+    state = tensor([[speed / turn, 0.0, math.pi / 2, 0.0, speed, turn]]).double()
+    before = Car().earlier(state, tensor(ago).double())
+    forward, lateral, yaw_rate = Car().body_velocity(before)
+    assert forward.item() == pytest.approx(speed) and abs(lateral.item()) < 1e-6 and yaw_rate.item() == turn
+    angle = -turn * ago
+    place = [speed / turn * math.cos(angle), speed / turn * math.sin(angle)]
+    assert before[0, :2].tolist() == pytest.approx(place, abs=0.5 * speed * turn * ago**2 * 1.1)
+
+
+def test_a_distance_has_a_slope_at_the_landmark() -> None:
+    state = torch.zeros(1, 6, requires_grad=True)
+    Unicycle().ranges(state).sum().backward()
+    assert bool(torch.isfinite(state.grad).all())

@@ -4,7 +4,6 @@ from collections import defaultdict
 from functools import partial
 from itertools import takewhile
 
-import torch
 from torch import Tensor
 
 from steady_ppl.data.trajectories import Trajectories
@@ -15,7 +14,9 @@ from steady_ppl.effects.catalogue.sensors import (
     SEES_LANDMARKS,
     Columns,
     among,
+    beside,
     each_sensor,
+    lists_sensors,
 )
 from steady_ppl.effects.catalogue.wheels import SPEED_AND_TURN
 from steady_ppl.effects.declaration import Choices, Effect, Names, Need, Pushes, declare, needs
@@ -37,21 +38,25 @@ def _groups(program: Program, data: Trajectories | None) -> Choices:
 
 
 def _quantities(program: Program, data: Trajectories | None) -> Choices:
-    """Each sensor that the program lists; without any the measurements in one unit together, called by what their names
+    """Each sensor that the program lists, and the other measurements in one unit together, called by what their names
     have in common."""
-    if isinstance(program, PlanarVehicle) and program.sensors:
-        return each_sensor()(program, data)
+    listed = each_sensor()(program, data) if lists_sensors(program) else []
+    known = {index for one in listed for index in one["columns"]}
     columns = defaultdict[str, list[int]](list)
     for index, unit in enumerate(program.measurement_units):
-        columns[unit].append(index)
-    if len(columns) == 1:
+        if index not in known:
+            columns[unit].append(index)
+    if listed and not columns:
+        return listed
+    if len(columns) == 1 and not listed:
         return [{}]
     names = [[program.measurement_names[index] for index in found] for found in columns.values()]
     letters = [takewhile(lambda at: len(set(at)) == 1, zip(*found, strict=False)) for found in names]
     begins = ["".join(letter for letter, *_ in same).rstrip("_0123456789") for same in letters]
     common = [begin or "_".join(found[:3]) for begin, found in zip(begins, names, strict=True)]
     called = common if len(set(common)) == len(common) else [found[0] for found in names]
-    return [{"columns": tuple(found), "at": at} for found, at in zip(columns.values(), called, strict=True)]
+    others = [{"columns": tuple(found), "at": at} for found, at in zip(columns.values(), called, strict=True)]
+    return [*listed, *others]
 
 
 NOISE: list[Effect] = []
@@ -71,7 +76,7 @@ def heavy_tails(self: Program, c: Tensor) -> Tensor:
 
 @_noise("blur", "1", typical=1.5, limit=2.0, sign=1, null=1.0, choices=_quantities, lacks=needs(MEASURED))
 def measurement_noise(self: Program, state: Tensor, c: Tensor, columns: tuple[int, ...] = ()) -> Tensor:
-    r"""σ → c σ of the measurements in one unit
+    r"""σ → c σ of the measurements in one unit, or of one sensor
 
     equation: \sigma \to c\,\sigma
     feels: sees worse (or better) than its data sheet says
@@ -93,8 +98,7 @@ def range_dependent_noise(self: Program, state: Tensor, c: Tensor, columns: Colu
     """
     away = self.ranges(state)
     if columns:
-        left = [away.new_zeros(*away.shape[:-1], n) for n in (columns[0], len(self.measurements) - columns[-1] - 1)]
-        away = torch.cat([left[0], away, left[1]], -1)
+        away = beside(away, columns, len(self.measurements))
     return (1 + c * away).clamp(min=0.05)
 
 

@@ -15,6 +15,7 @@ from steady_ppl.model.program import Program
 
 SEES_LANDMARKS = ("bearing", "range")  # kinds of sensors
 SCALED = ("bearing", "range", "velocity", "wheel speed", "yaw rate")  # kinds whose readings may be too large
+OF_POSE = ("bearing", "range", "position", "heading")  # kinds whose readings a moment ago follow from the state
 
 
 def sensors_of(program: Program, *kinds: str) -> dict[str, tuple[int, ...]]:
@@ -28,13 +29,25 @@ def sensors_of(program: Program, *kinds: str) -> dict[str, tuple[int, ...]]:
         seen = program.landmark_columns
         return {kind: seen[kind] for kind in seen if not kinds or kind in kinds}
     columns = program.sensor_columns
-    return {one.name: columns[one.name] for one in program.sensors if not kinds or one.kind in kinds}
+    of_kinds = [one.name for one in program.sensors if not kinds or one.kind in kinds]
+    return {name: columns[name] for name in of_kinds if name in columns}
+
+
+def lists_sensors(program: Program) -> bool:
+    """Whether a program lists sensors that it carries."""
+    return isinstance(program, PlanarVehicle) and bool(program.sensors) and bool(program.sensor_columns)
 
 
 def among(columns: tuple[int, ...], like: Tensor) -> Tensor:
     """One in some columns and zero in the others, `(K,)`; ones where none is named."""
     every = range(like.shape[-1])
     return torch.tensor([float(index in (columns or every)) for index in every]).to(like)
+
+
+def beside(values: Tensor, columns: tuple[int, ...], count: int) -> Tensor:
+    """Values `(..., k)` of neighbouring columns among `count`, `(..., count)`, zero in the others."""
+    left = [values.new_zeros(*values.shape[:-1], n) for n in (columns[0], count - columns[-1] - 1)]
+    return torch.cat([left[0], values, left[1]], -1)
 
 
 def each_sensor(*kinds: str) -> Callable[[Program, Trajectories | None], Choices]:
@@ -56,34 +69,53 @@ BEARINGS: Need = (
     lambda program: program.sees_bearings or sensors_of(program, "bearing"),
     "it acts on bearings to landmarks, and the program measures something else",
 )
+ALONE_OR_LISTED: Need = (
+    lambda program: program.sees_bearings or lists_sensors(program),
+    "beside other readings of a program's own it is sensor_bias",
+)
 LANDMARKS: Need = (
     lambda program: program.sees_bearings or sensors_of(program, *SEES_LANDMARKS),
     "it acts on bearings or distances to landmarks, and the program measures something else",
 )
-TWO_LANDMARKS: Need = (lambda program: len(program.measurements) != 1, "there is one landmark: its bias is that of all")
+TWO_LANDMARKS: Need = (lambda program: len(program.landmarks) != 1, "there is one landmark: its bias is that of all")
 OTHER_SENSORS: Need = (
-    lambda program: not (isinstance(program, PlanarVehicle) and program.sees_bearings) and _others(program),
+    lambda program: not (isinstance(program, PlanarVehicle) and program.sees_bearings),
     "of bearings to landmarks it is bearing_bias or landmark_bias",
 )
-SAME_SENSOR: Need = (
-    lambda program: sensors_of(program, *SCALED) or len(set(program.measurement_units)) == 1,
-    "the measurements have different units, and no `sensors` are listed",
+ONE_UNIT: Need = (
+    lambda program: lists_sensors(program) or sensors_of(program) or len(set(program.measurement_units)) == 1,
+    "the measurements have different units",
 )
-LISTED: Need = (
-    lambda program: isinstance(program, PlanarVehicle) and program.sensors,
-    "the program lists no `sensors`",
+WITH_SCALE: Need = (
+    lambda program: not lists_sensors(program) or sensors_of(program, *SCALED),
+    "of positions and headings no size is measured",
 )
-POSITION: Need = (lambda program: sensors_of(program, "position"), "no sensor of a position is listed (`sensors`)")
+LISTED: Need = (lists_sensors, "the program lists no `sensors`")
+POSE: Need = (
+    lambda program: sensors_of(program, *OF_POSE),
+    "what its sensors read a moment ago does not follow from the state",
+)
+ANTENNA: Need = (
+    lambda program: _antennas(program, None),
+    "no position is measured by a listed sensor (`sensors`) whose offset is not learned",
+)
 RATES: Need = (
     lambda program: program.derivatives,
     "no state component is known to be the velocity of another (`motion`)",
 )
 
 
-def _others(program: Program) -> list[int]:
-    """The columns that are no bearings to landmarks."""
-    bearings = {index for columns in sensors_of(program, "bearing").values() for index in columns}
-    return [index for index in range(len(program.measurements)) if index not in bearings]
+def _antennas(program: Program, data: Trajectories | None) -> Choices:
+    """Every listed position but those whose offset the program learns."""
+    if not lists_sensors(program):
+        return []
+    learned = {one.name for one in program.sensors if isinstance(getattr(one, "offset", None), str)}
+    found = {name: columns for name, columns in sensors_of(program, "position").items() if name not in learned}
+    return [{"columns": columns, **at} for at, columns in _named(found)]
+
+
+def _each_in_pose(program: Program, data: Trajectories | None) -> Choices:
+    return [{"columns": columns, "sensor": name, "at": name} for name, columns in sensors_of(program, *OF_POSE).items()]
 
 
 def _one_by_one(program: Program, columns: Iterable[int]) -> Choices:
@@ -96,10 +128,12 @@ def _each_bearing(program: Program, data: Trajectories | None) -> Choices:
 
 
 def _each_other(program: Program, data: Trajectories | None) -> Choices:
-    """All distances of a sensor together, then each reading alone."""
+    """Each reading, of listed sensors not the bearings', and all distances of a sensor together."""
+    listed = sensors_of(program, "bearing") if lists_sensors(program) else {}
+    bearings = {index for columns in listed.values() for index in columns}
+    alone = _one_by_one(program, (index for index in range(len(program.measurements)) if index not in bearings))
     ranges = [(name, columns) for name, columns in sensors_of(program, "range").items() if len(columns) > 1]
-    together = [{"component": columns[0], "columns": columns, "at": name} for name, columns in ranges]
-    return [*together, *_one_by_one(program, _others(program))]
+    return [*alone, *({"component": columns[0], "columns": columns, "at": name} for name, columns in ranges)]
 
 
 SENSORS: list[Effect] = []
@@ -118,7 +152,9 @@ def bearing_bias(self: Program, state: Tensor, measured: Tensor, c: Tensor, colu
     return measured + (c * among(columns, measured) if columns else c)
 
 
-@_on_readings("rad", typical=0.06, limit=0.5, choices=_each_bearing, lacks=needs(PLANAR, TWO_LANDMARKS, BEARINGS))
+@_on_readings(
+    "rad", typical=0.06, limit=0.5, choices=_each_bearing, lacks=needs(PLANAR, TWO_LANDMARKS, BEARINGS, ALONE_OR_LISTED)
+)
 def landmark_bias(self: Program, state: Tensor, measured: Tensor, c: Tensor, component: Any) -> Tensor:
     r"""y_i → y_i + c, one landmark
 
@@ -142,7 +178,7 @@ def sensor_bias(
     return measured + c * among(columns or (component,), measured)
 
 
-@_on_readings("1", typical=0.03, limit=0.3, choices=each_sensor(*SCALED), lacks=needs(SAME_SENSOR))
+@_on_readings("1", typical=0.03, limit=0.3, choices=each_sensor(*SCALED), lacks=needs(ONE_UNIT, WITH_SCALE))
 def sensor_scale(self: Program, state: Tensor, measured: Tensor, c: Tensor, columns: Columns = ()) -> Tensor:
     r"""y → (1 + c) y
 
@@ -158,8 +194,8 @@ def sensor_scale(self: Program, state: Tensor, measured: Tensor, c: Tensor, colu
     typical=(0.3, 0.1),
     limit=5.0,
     components=("ahead", "left"),
-    choices=each_sensor("position"),
-    lacks=needs(POSITION),
+    choices=_antennas,
+    lacks=needs(ANTENNA),
 )
 def antenna_offset(self: Program, state: Tensor, measured: Tensor, c: Tensor, columns: Columns) -> Tensor:
     r"""y → y + R(θ) c, one position
@@ -175,18 +211,17 @@ def antenna_offset(self: Program, state: Tensor, measured: Tensor, c: Tensor, co
     return measured + moved
 
 
-@_on_readings("s", typical=0.1, limit=1.0, choices=each_sensor(), lacks=needs(LISTED, RATES))
-def sensor_delay(self: Program, state: Tensor, measured: Tensor, c: Tensor, columns: Columns) -> Tensor:
+@_on_readings("s", typical=0.1, limit=1.0, choices=_each_in_pose, lacks=needs(LISTED, POSE))
+def sensor_delay(self: Program, state: Tensor, measured: Tensor, c: Tensor, columns: Columns, sensor: str) -> Tensor:
     r"""y(t) → y(t - c), one sensor
 
     equation: y(t) \to y(t - c)
     feels: one sensor shows where it was a moment ago
     occurs: images that are processed before they are stamped, receivers that filter, messages that wait
     """
-    (sensor,) = (one for one in self.sensors if self.sensor_columns[one.name] == columns)
-    change = sensor.reading(self, self.earlier(state, c)) - sensor.reading(self, state)
-    left = [change.new_zeros(*change.shape[:-1], count) for count in (columns[0], measured.shape[-1] - columns[-1] - 1)]
-    return measured + torch.cat([left[0], change, left[1]], -1)
+    (late,) = (one for one in self.sensors if one.name == sensor)
+    change = late.reading(self, self.earlier(state, c)) - late.reading(self, state)
+    return measured + beside(change, columns, measured.shape[-1])
 
 
 @declare(SENSORS, "viewpoint", "s", typical=0.12, limit=1.0, lacks=needs(RATES))

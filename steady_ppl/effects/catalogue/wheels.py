@@ -20,11 +20,15 @@ SPEED_AND_TURN: Need = (
 )
 STEERED: Need = (
     lambda program: "speed" in program.control_names and _steering(program),
-    "the controls are not a speed and a turn rate or a steering angle",
+    "the controls are not a speed and a turn rate or a steering angle (`speed`, `turn`, `steering [rad]`)",
+)
+STEERS: Need = (
+    lambda program: _steering(program),
+    "no control is a turn rate or a steering angle (`turn`, `steering`)",
 )
 STEERING_ANGLE: Need = (
     lambda program: ("steering", "rad") in zip(program.control_names, program.control_units, strict=True),
-    "no control is a steering angle (`steering [rad]`)",
+    "the controls are not a speed and a turn rate or a steering angle (`speed`, `turn`, `steering [rad]`)",
 )
 GRIP: Need = (lambda program: not program.slips, "the lateral velocity is free")
 
@@ -50,7 +54,7 @@ def _slow(speed: float) -> Callable[[Program, Trajectories | None], Choices]:
 
 WHEELS: list[Effect] = []
 _on_command = partial(declare, WHEELS, "command", lacks=needs(SPEED_AND_TURN, PLANAR))
-_on_steering = partial(declare, WHEELS, "command", lacks=needs(STEERED, PLANAR))
+_on_steering = partial(declare, WHEELS, "command", lacks=needs(STEERS, PLANAR))
 _on_lateral_velocity = partial(declare, WHEELS, "push", lacks=needs(PLANAR, GRIP))
 _on_wheels = partial(declare, WHEELS, "push", lacks=needs(STEERED, PLANAR, GRIP))
 
