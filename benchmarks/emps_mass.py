@@ -11,8 +11,10 @@ one. What is left of the error is the table's, not that of a search. Writes `res
 from __future__ import annotations
 
 import argparse
+import ast
 import os
 import sys
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -70,11 +72,24 @@ class Known(Program):
 
 
 def world_of(case: Path) -> dict[str, Any]:
-    """The constants of the case's world, from the head of its script."""
-    lines = (case / "make.py").read_text().partition("def lap")[0].splitlines()
+    """The constants that the script of the case's world begins with, and what follows from them: the friction's grid
+    `vg` and the reference's acceleration `a` at each of its steps."""
     found: dict[str, Any] = {}
-    exec("\n".join(["import numpy as np", *lines[1:]]), found)  # its first line imports what the rest needs
-    return found
+    for line in ast.parse((case / "make.py").read_text()).body:
+        if not isinstance(line, ast.Assign):
+            continue
+        value = line.value.args[0] if isinstance(line.value, ast.Call) and line.value.args else line.value
+        with suppress(ValueError):  # it is computed
+            constants = ast.literal_eval(value)
+            (target,) = line.targets
+            several = isinstance(target, ast.Tuple)
+            names = [one.id for one in target.elts] if several else [target.id]
+            found |= dict(zip(names, constants if several else [constants], strict=True))
+    found["vg"] = np.linspace(-found["VM"], found["VM"], len(found["FR"]))
+    runs = [np.full(count, 0.0) for count in found["RUNS"]]  # at rest and accelerated in turns
+    for run, value in zip(runs[::2], found["ACC"], strict=True):
+        run += value
+    return found | {"a": np.concatenate(runs), "FR": np.array(found["FR"])}
 
 
 def drives(world: dict[str, Any], every: int, by_mean: bool, seed: int) -> Trajectories:

@@ -101,8 +101,8 @@ class PlanarVehicle(Program):
 
     @property
     def landmark_columns(self) -> Mapping[str, tuple[int, ...]]:
-        """ "bearing" and "range" → the measurements `bearing_0 [rad]`, … or `range_0 [m]`, …, where there is one a
-        landmark, in order."""
+        """Kind of what is read of landmarks → the measurements `bearing_0 [rad]`, … or `range_0 [m]`, …, where there is
+        one a landmark, in order."""
         found = self._places({kind: [f"{kind}_{i}" for i in range(len(self.landmarks))] for kind in LANDMARK_UNITS})
         return {kind: at for kind, at in found.items() if self.measurement_units[at[0]] == LANDMARK_UNITS[kind]}
 
