@@ -237,19 +237,17 @@ def _no_models(found: Proof, name: str) -> str:
 def _lost_to(found: Proof, name: str) -> tuple[str, str] | None:
     """How far ahead, and to what that knows nothing of the vehicle, a program surely loses by a tenth; None where it
     surely wins at some time ahead or in some unit."""
-    horizons = list(reversed(list(found.horizons)[:BANDED_HORIZONS]))
+    named = {rows: horizon for horizon, rows in list(found.horizons.items())[:BANDED_HORIZONS]}
     for simple, (kind, words) in SIMPLE_ROWS.items():
         if simple not in found.rows:
             continue
-        at = dict[str, list[Change]]()
-        for horizon in horizons:
-            keys = [key for key in found.rows[name].sums if key[::2] == (kind, found.horizons[horizon])]
-            at[horizon] = [change for change in _differences(found, name, simple, keys).values() if change]
-        if any(change.interval[1] < 0 for changes in at.values() for change in changes):
+        keys = [key for key in found.rows[name].sums if key.kind == kind and key.horizon in named]
+        errors = {key: change for key, change in _differences(found, name, simple, keys).items() if change}
+        if any(change.interval[1] < 0 for change in errors.values()):
             continue
-        for horizon, changes in at.items():
-            if any(change.interval[0] > 0 and (change.relative or 0.0) > MIN_LOSS for change in changes):
-                return horizon, words
+        lost = [key for key, change in errors.items() if change.interval[0] > 0 and (change.relative or 0.0) > MIN_LOSS]
+        if lost:
+            return named[max(key.horizon for key in lost)], words
     return None
 
 

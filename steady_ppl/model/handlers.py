@@ -213,6 +213,12 @@ def unwrapped(fn: Any) -> Any:
     return fn
 
 
+def mean_reading(fn: Any) -> Tensor:
+    """The mean of a measurement site, in its unit; on the circle where its distribution lives there."""
+    base = unwrapped(fn)
+    return -base.residual(torch.zeros_like(base.loc)) if hasattr(base, "residual") else base.loc
+
+
 def residual(fn: Any, value: Tensor) -> Tensor:
     """`value − mean` of a measurement site, in its unit and as `value`, on the circle where its distribution lives
     there."""

@@ -21,6 +21,7 @@ from steady_ppl.model.handlers import (
     as_event,
     as_vector,
     broadcast_shapes,
+    mean_reading,
     normal_moments,
     unwrapped,
     with_moments,
@@ -65,9 +66,7 @@ def misread(program: Program, change: Callable[[Tensor], Tensor]) -> Transformin
     """Change the mean measurement, `(..., K)` and angles on the circle, while a program's `observe` runs."""
 
     def at_site(fn: Any, columns: slice) -> Any:
-        base = unwrapped(fn)
-        reading = -base.residual(torch.zeros_like(base.loc)) if hasattr(base, "residual") else base.loc
-        reading = as_vector(reading, fn.event_dim)
+        reading = as_vector(mean_reading(fn), fn.event_dim)
         whole = reading.new_zeros((*reading.shape[:-1], len(program.measurements)))
         whole = torch.cat([whole[..., : columns.start], reading, whole[..., columns.stop :]], -1)
         return with_moments(fn, loc=as_event(change(whole)[..., columns], fn.event_dim))

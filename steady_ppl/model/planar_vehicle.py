@@ -171,10 +171,14 @@ class PlanarVehicle(Program):
     def earlier(self, state: Tensor, ago: Tensor) -> Tensor:
         """The state `ago` seconds before, `(..., D)`, in a steady curve: the velocity turns with the heading."""
         moved = super().earlier(state, ago)
-        turn = -ago * state[..., 5]
-        cos, sin, vx, vy = turn.cos(), turn.sin(), state[..., 3], state[..., 4]
-        turned = torch.stack([cos * vx - sin * vy, sin * vx + cos * vy], -1)
-        return torch.cat([moved[..., :3], turned, moved[..., 5:]], -1)
+        velocity = torch.stack(turned(-ago * state[..., 5], state[..., 3], state[..., 4]), -1)
+        return torch.cat([moved[..., :3], velocity, moved[..., 5:]], -1)
+
+
+def turned(angle: Tensor, ahead: Tensor, left: Tensor) -> tuple[Tensor, Tensor]:
+    """A vector's components in axes from which its own are turned by an angle, rad anticlockwise; each `(...)`."""
+    cos, sin = angle.cos(), angle.sin()
+    return cos * ahead - sin * left, sin * ahead + cos * left
 
 
 def stack(*components: Tensor) -> Tensor:

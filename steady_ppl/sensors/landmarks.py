@@ -6,8 +6,9 @@ import pyro.distributions as dist
 from torch import Tensor
 
 from steady_ppl.errors import ProgramError
+from steady_ppl.model.handlers import mean_reading
 from steady_ppl.model.planar_vehicle import bearings_to
-from steady_ppl.sensors.sensor import Sensor, mean_of, setting
+from steady_ppl.sensors.sensor import Sensor, setting
 
 
 class _OfLandmarks(Sensor):
@@ -28,7 +29,7 @@ class Bearings(_OfLandmarks):
     of_circle = True
 
     def reading(self, program: Any, state: Tensor) -> Tensor:
-        return mean_of(self.distribution(program, state))
+        return mean_reading(self.distribution(program, state))
 
     def distribution(self, program: Any, state: Tensor) -> dist.Independent:
         return bearings_to(program.landmarks, state, sd=setting(program, self.sd, state))

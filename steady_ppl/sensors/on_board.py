@@ -8,7 +8,7 @@ from typing import Any
 from torch import Tensor
 
 from steady_ppl.errors import ProgramError
-from steady_ppl.model.planar_vehicle import stack
+from steady_ppl.model.planar_vehicle import stack, turned
 from steady_ppl.sensors.sensor import Sensor, Setting, setting
 
 
@@ -37,9 +37,8 @@ class Position(Sensor):
     def reading(self, program: Any, state: Tensor) -> Tensor:
         if self.offset is None:
             return state[..., :2]
-        ahead, left = setting(program, self.offset, state).unbind(-1)
-        cos, sin = state[..., 2].cos(), state[..., 2].sin()
-        return stack(state[..., 0] + cos * ahead - sin * left, state[..., 1] + sin * ahead + cos * left)
+        x, y = turned(state[..., 2], *setting(program, self.offset, state).unbind(-1))
+        return stack(state[..., 0] + x, state[..., 1] + y)
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,6 @@ from torch import Tensor
 
 from steady_ppl.errors import ProgramError
 from steady_ppl.model.distributions import WrappedNormal
-from steady_ppl.model.handlers import unwrapped
 
 Setting = float | Sequence[float] | str
 """A number, or the name of one of the program's parameters or constants, which may then be learned."""
@@ -75,9 +74,3 @@ def setting(program: Any, value: Setting, like: Tensor) -> Any:
             raise ProgramError(f"program {type(program).__name__}: {said}", site="sensors")
         value = getattr(program, value)
     return value if isinstance(value, float | int | Tensor) else like.new_tensor(value)
-
-
-def mean_of(fn: dist.Independent) -> Tensor:
-    """The mean of a distribution of readings, `(..., K)`; of angles, on the circle."""
-    base = unwrapped(fn)
-    return -base.residual(base.loc.new_zeros(())) if hasattr(base, "residual") else base.loc

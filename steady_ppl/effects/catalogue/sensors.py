@@ -10,7 +10,7 @@ from torch import Tensor
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.effects.catalogue.forces import PLANAR
 from steady_ppl.effects.declaration import Choices, Effect, Need, declare, needs
-from steady_ppl.model.planar_vehicle import PlanarVehicle
+from steady_ppl.model.planar_vehicle import PlanarVehicle, turned
 from steady_ppl.model.program import Program
 
 SEES_LANDMARKS = ("bearing", "range")  # kinds of sensors
@@ -204,11 +204,8 @@ def antenna_offset(self: Program, state: Tensor, measured: Tensor, c: Tensor, co
     feels: the measured point swings around the vehicle in turns
     occurs: a GPS antenna on the bow or the roof, a marker that is not above the axle
     """
-    x, y = columns
-    cos, sin = state[..., 2:3].cos(), state[..., 2:3].sin()
-    ahead, left = c.unbind(-1)
-    moved = (cos * ahead - sin * left) * among((x,), measured) + (sin * ahead + cos * left) * among((y,), measured)
-    return measured + moved
+    moved = torch.stack(turned(state[..., 2], *c.unbind(-1)), -1)
+    return measured + beside(moved, columns, measured.shape[-1])
 
 
 @_on_readings("s", typical=0.1, limit=1.0, choices=_each_in_pose, lacks=needs(LISTED, POSE))

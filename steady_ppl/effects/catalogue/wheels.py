@@ -1,4 +1,4 @@
-"""Vehicles on wheels that are told a speed and a turn rate or a steering angle, as programs without slip have them."""
+"""Vehicles on wheels, commanded by a speed and a turn rate or a steering angle, as programs without slip have them."""
 
 import math
 from collections.abc import Callable
