@@ -1,11 +1,13 @@
 """Prove an improvement: programs before and after on drives that neither was fitted on, with paired intervals.
 
 Everything goes by the linearised program: log p(y) by its smoother, predictions by its filter, as in `check`. A
-particle filter says how far its log p(y) is from the program's own.
+particle filter says how far its log p(y) is from the program's own. Readings that every program finds wrong, as a
+position fix that jumps, are left out: one of them would decide a mean of squares.
 """
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
+from functools import reduce
 
 import numpy as np
 import torch
@@ -29,6 +31,8 @@ from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.errors import DataError, UsageError
 from steady_ppl.gaussian.linearize import ReferencePath
 from steady_ppl.gaussian.predict import suited_horizons
+from steady_ppl.likelihood.outliers import Outliers, find_outliers
+from steady_ppl.likelihood.scores import has_heavy_tails
 from steady_ppl.model.problem import Problem
 from steady_ppl.model.program import Program, for_program
 from steady_ppl.runs.diagnostics import diagnose_units
@@ -91,15 +95,28 @@ def prove(
             notes.append("some rows were fitted with a known start and some without: all are judged without")
     reference = next(iter(programs), "") if reference is None else reference
     _require(programs, reference, truth, data)
-    judged, ahead = dict[str, Judged](), dict[str, int]()
-    with stages(*((f"judging {name}", 1) for name in programs), ("judging the constant velocity", 0.5)) as begin:
-        for name, program in programs.items():
-            begin()
-            same = next((other for other in judged if programs[other] is program), None)
-            path = (paths or {}).get(name)
-            problem = Problem(program, for_program(program, data), known_start)
-            ahead = ahead or suited_horizons(program, problem.data, PROOF_HORIZONS, horizons)
-            judged[name] = judged[same] if same else judge_program(name, problem, ahead, seed, path)
+    first = programs[reference]
+    ahead = suited_horizons(first, for_program(first, data), PROOF_HORIZONS, horizons)
+
+    def judge(data: Trajectories, paths: Mapping[str, ReferencePath]) -> dict[str, Judged]:
+        judged = dict[str, Judged]()
+        with stages(*((f"judging {name}", 1) for name in programs)) as begin:
+            for name, program in programs.items():
+                begin()
+                same = next((other for other in judged if programs[other] is program), None)
+                problem = Problem(program, for_program(program, data), known_start)
+                judged[name] = judged[same] if same else judge_program(name, problem, ahead, seed, paths.get(name))
+        return judged
+
+    shares = ("", len(programs)), ("without wrong readings", len(programs)), ("judging the constant velocity", 0.5)
+    with stages(*shares) as begin:
+        begin()
+        judged = judge(data, paths or {})
+        begin()
+        outliers = _wrong_by_all(list(judged.values()))
+        if outliers.found:
+            data = outliers.without(data)
+            judged = judge(data, {name: one.ahead.linearization.path for name, one in judged.items()})
         begin()
         before, true = judged[reference], judged.get(truth or "")
         coasting = judge_constant_velocity(before) if with_constant_velocity else None
@@ -116,7 +133,18 @@ def prove(
     drives = before.problem.data
     notes += drives.uneven_steps + diagnose_units(before.problem.program, drives)
     notes += _few_rows(drives, ahead, known_start) + unconverged(rows) + _blown_up(found) + doubtful(found, data)
-    return Proof(found, reference, ahead, drives.median_step, len(data), known_start, seed, notes)
+    return Proof(found, reference, ahead, drives.median_step, len(data), known_start, seed, outliers, notes)
+
+
+def _wrong_by_all(judged: Sequence[Judged]) -> Outliers:
+    """The readings that every program finds wrong; none where one of them has tails that may explain them."""
+    data, each = judged[0].problem.data, list[Outliers]()
+    for one in {id(one.problem.program): one for one in judged}.values():
+        path = one.ahead.linearization.path
+        if has_heavy_tails(one.problem.program, path.states[:1, :1]):
+            return Outliers(data, [], torch.zeros_like(data.observed))
+        each.append(find_outliers(one.problem.without_truth(), path, against_tails=False))
+    return reduce(Outliers.shared_with, each)
 
 
 def _counted(judged: Iterable[Judged]) -> dict[int, Tensor]:

@@ -21,6 +21,7 @@ from steady_ppl.comparison.scores import (
     paired,
 )
 from steady_ppl.effects import attached
+from steady_ppl.likelihood.outliers import Outliers
 from steady_ppl.model.program import error_indices
 from steady_ppl.utils.context import Displayed
 from steady_ppl.utils.text import TEXT_WIDTH, aligned, figure, with_unit
@@ -57,6 +58,7 @@ class Proof(Displayed):
         trajectories: how many drives.
         known_start: whether the true first states were given.
         seed: of the resampling.
+        outliers: readings that every program finds wrong; nothing else is about them.
         notes: what was left out or is not as it seems.
     """
 
@@ -67,6 +69,7 @@ class Proof(Displayed):
     trajectories: int
     known_start: bool
     seed: int
+    outliers: Outliers
     notes: list[str]
 
     @property
@@ -88,6 +91,7 @@ class Proof(Displayed):
                 | {"scales": row.scales, "against_reference": _against_reference(self, name)}
                 for name, row in self.rows.items()
             ],
+            "outliers": self.outliers.figures,
             "notes": self.notes,
         }
 
@@ -119,6 +123,7 @@ class Proof(Displayed):
             cells = [[row["row"], *_errors(row, kind, of, far)] for row in rows if of in row[kind]]
             lines += [*_table([header, *cells]), ""] if cells else []
         lines += _scales([row for row in rows if row["row"] not in (NOISE_FLOOR, LAST_MEASUREMENT)])
+        lines += self.outliers.lines()
         for note in self.notes:
             lines += textwrap.wrap(f"note: {note}", TEXT_WIDTH)
         return "\n".join(lines)

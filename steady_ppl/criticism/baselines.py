@@ -54,6 +54,9 @@ class ConstantVelocity(Program):
     def actuators(self, control: Tensor, time: Tensor) -> Tensor:
         return self.of.actuators(control, time)
 
+    def between_rows(self, control: Tensor, time: Tensor) -> Tensor:
+        return self.of.between_rows(control, time)
+
 
 @dataclass(frozen=True)
 class Reference:

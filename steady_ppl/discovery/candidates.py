@@ -50,7 +50,8 @@ CLEAR_GAIN = 10.0  # nats of held-out log p(y) for which a test need only be nea
 NEAR_FAMILY_LEVEL = FAMILY_LEVEL / 5  # p-value of a single test that is near it
 MAX_NATS_BEHIND = 25.0  # nats behind the best on the drives of a fold, with which a candidate is hardly worth another
 MIN_STATISTIC_TO_RETRY = 20.0  # statistic of a test from which a fit that gains nothing has gone astray
-LINEAR_FORMS = ("push", "command", "history", "measured", "viewpoint")  # of effects in proportion to the coefficient
+# forms of effects in proportion to the coefficient
+LINEAR_FORMS = ("push", "command", "history", "between", "measured", "viewpoint")
 OF_MEASUREMENTS = ("measured", "blur")  # forms of effects that act on one column or on a few
 UNEXPLAINED = "colour"  # the form of effects that imitate whatever is missing, and may enter when nothing else does
 MIN_GAIN_OF_PLACE = 0.3  # nats by which another knee or place has to be likelier

@@ -175,6 +175,13 @@ def _history(base: Any, variant: Variant) -> Methods:
     return {"actuators": actuators}
 
 
+def _between(base: Any, variant: Variant) -> Methods:
+    def between_rows(self: Any, control: Tensor, time: Tensor) -> Tensor:
+        return variant(self, control, time, c=coefficient(self, variant))
+
+    return {"between_rows": between_rows}
+
+
 def _viewpoint(base: Any, variant: Variant) -> Methods:
     def observe(self: Any, state: Tensor) -> None:
         return base.observe(self, variant(self, state, c=coefficient(self, variant)))
@@ -232,6 +239,7 @@ _METHODS_OF_FORM: dict[str, Callable[[Any, Variant], Methods]] = {
     "push": _push,
     "command": _command,
     "history": _history,
+    "between": _between,
     "measured": _under(lambda program, act, state: interventions.misread(program, partial(act, state)), "observe"),
     "viewpoint": _viewpoint,
     "spread": _under(_widened, "transition"),

@@ -6,6 +6,7 @@ with the coefficient as `c`. The form says what it takes and returns:
     push       (self, state, control, time, step, c)   adds to channels' means: {channel: (...)}; may ask for `mean`
     command    (self, state, control, time, c)         the control that acts, (..., U)
     history    (self, control, time, c)                the same of whole trajectories, (rows, trajectories, U)
+    between    (self, control, time, c)                that of all substeps, (rows · substeps, trajectories, U)
     measured   (self, state, measured, c)              what is measured on average, (..., K)
     viewpoint  (self, state, c)                        the state that is measured, (..., D)
     spread     (self, state, control, time, c)         factors on channels' standard deviations: {channel: (...)}
@@ -33,7 +34,7 @@ from steady_ppl.model.program import Program
 
 VERDICT_OF_FORM = {
     "push": "dynamics",
-    **dict.fromkeys(("command", "history"), "actuator"),
+    **dict.fromkeys(("command", "history", "between"), "actuator"),
     **dict.fromkeys(("measured", "viewpoint"), "sensor"),
     **dict.fromkeys(("spread", "blur", "tails", "colour"), "noise"),
 }

@@ -89,6 +89,12 @@ class Outliers:
         found = _in_order([*self.found, *other.found])
         return replace(self, found=found, wrong=self.wrong | other.wrong, note=self.note or other.note)
 
+    def shared_with(self, other: Outliers) -> Outliers:
+        """Those of these drives that another program finds wrong too."""
+        wrong = self.wrong & other.wrong
+        shared = [one for one in self.found if bool(wrong[one.rows[0] : one.rows[1] + 1, one.drive].any())]
+        return replace(self, found=shared, wrong=wrong)
+
     @property
     def cost(self) -> float:
         return sum(one.cost for one in self.found)

@@ -414,7 +414,7 @@ def _of_ends(program: Program, data: Trajectories, at: Smoothed, parts: list[Ele
 
 def of_actuators(program: Program, data: Trajectories, parts: Sequence[Element]) -> list[int]:
     """Which learnable numbers change the acting controls: a kernel is given these and knows no slopes of theirs."""
-    if type(program).actuators is Program.actuators:
+    if not program.acts_on_commands:
         return []
     sides = (on_both_sides(part, lambda: acting_controls(program, data)) for part in parts)
     return [index for index, (up, down) in enumerate(sides) if not torch.equal(up, down)]

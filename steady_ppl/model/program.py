@@ -196,6 +196,19 @@ class Program(PyroModule):
         """
         return control
 
+    def between_rows(self, control: Tensor, time: Tensor) -> Tensor:
+        """Return the commands of all substeps, `(rows · substeps, trajectories, U)`: held over a row.
+
+        Arguments are those of `actuators`, which is given the result.
+        """
+        return control.repeat_interleave(self.substeps, 0)
+
+    @property
+    def acts_on_commands(self) -> bool:
+        """Whether `actuators` or `between_rows` is not the one that takes commands as they are."""
+        own, plain = type(self), Program
+        return own.actuators is not plain.actuators or own.between_rows is not plain.between_rows
+
     state_names, state_units = _components("states")
     control_names, control_units = _components("controls")
     measurement_names, measurement_units = _components("measurements")

@@ -176,17 +176,17 @@ def acting_controls(program: Program, data: Trajectories) -> Tensor:
 
 
 def acting(program: Program, commands: Tensor, elapsed: Tensor) -> Tensor:
-    """Return what actuators make of commands `(rows, B, U)` that are held over a row, at `elapsed` s `(rows, B)`.
+    """Return what actuators make of commands `(rows, B, U)` at `elapsed` s `(rows, B)`.
 
-    It is as `commands`, or where actuators change them within a row the substeps' controls side by side, `(…, K U)`.
+    It is as `commands`, or where they change within a row the substeps' controls side by side, `(…, K U)`.
     """
     count = program.substeps
-    if count == 1 or type(program).actuators is Program.actuators or len(elapsed) < 2:
+    if count == 1 or not program.acts_on_commands or len(elapsed) < 2:
         return program.actuators(commands, elapsed)
     rows, drives, controls = commands.shape
     shares = torch.arange(count, dtype=elapsed.dtype, device=elapsed.device) / count
     times = (elapsed.unsqueeze(1) + shares[:, None] * row_spans(elapsed).unsqueeze(1)).flatten(0, 1)
-    act = program.actuators(commands.repeat_interleave(count, 0), times)
+    act = program.actuators(program.between_rows(commands, elapsed), times)
     return act.unflatten(0, (rows, count)).movedim(1, 2).reshape(rows, drives, count * controls)
 
 

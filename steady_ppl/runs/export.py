@@ -42,7 +42,7 @@ class Dynamics(nn.Module):
     @property
     @torch.no_grad()
     def remembers(self) -> bool:
-        if type(self.program).actuators is Program.actuators:
+        if not self.program.acts_on_commands:
             return False
         like = next(self.program.parameters(), torch.zeros(()))
         elapsed = self.step * torch.arange(IMPULSE_ROWS, dtype=like.dtype, device=like.device)[:, None]
@@ -50,7 +50,7 @@ class Dynamics(nn.Module):
         for size in IMPULSE_SIZES:
             once = still.clone()
             once[0] = size
-            if not torch.equal(self.program.actuators(once, elapsed)[1:], self.program.actuators(still, elapsed)[1:]):
+            if not torch.equal(acting(self.program, once, elapsed)[1:], acting(self.program, still, elapsed)[1:]):
                 return True
         return False
 

@@ -82,6 +82,34 @@ def test_the_vehicle_that_keeps_its_velocity_loses(drag):
     assert against["state"]["location"]["1 s"]["relative_interval"][0] > 0
 
 
+def test_a_reading_that_both_find_wrong_is_left_out_of_every_figure(drag, dragged, truth):
+    row, drive = 30, 4
+    spoiled = replace(dragged, measurements=dragged.measurements.clone())
+    spoiled.measurements[row, drive, 2] += 2.5  # rad, 29 standard deviations
+    rows = {"before": hovercraft(), "after": truth}
+    found = prove(rows, spoiled, known_start=True, truth="after")
+    (outlier,) = found.outliers.found
+    assert (outlier.label, outlier.rows, outlier.columns) == (dragged.labels[drive], (row, row), ("y.bearing_2",))
+    wrong = torch.zeros_like(dragged.observed)
+    wrong[row, drive, 2] = True
+    masked = prove(rows, dragged.without(wrong), known_start=True, truth="after")
+    for name in rows:
+        one, other = (line(proof, name)["measurement"]["rad"]["3 s"] for proof in (found, masked))
+        assert one == pytest.approx(other, rel=1e-4)
+    assert "1 reading left out as wrong" in str(found)
+    assert [one["columns"] for one in found.figures["outliers"]] == [["y.bearing_2"]]
+    assert not drag.outliers.found
+
+
+def test_a_program_with_heavy_tails_is_asked_about_every_reading(dragged, truth):
+    spoiled = replace(dragged, measurements=dragged.measurements.clone())
+    spoiled.measurements[30, 4, 2] += 2.5
+    tailed = truth.with_effect("heavy_tails", 0.3)
+    found = prove({"before": truth, "after": tailed}, spoiled, known_start=True, with_constant_velocity=False)
+    assert not found.outliers.found
+    assert line(found, "after")["against_reference"]["log_likelihood"]["difference"] > 5
+
+
 def test_the_noise_scales_are_the_programs(drag):
     scales = line(drag, "after")["scales"]
     assert scales["channels"] == pytest.approx({"forward [m/s²]": 0.08, "lateral [m/s²]": 0.08, "yaw [rad/s²]": 0.05})

@@ -10,10 +10,11 @@ from torch import Tensor
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.effects.catalogue.forces import PLANAR, THRUSTS
 from steady_ppl.effects.declaration import Choices, Effect, Names, Need, declare, needs
-from steady_ppl.model.actuation import delayed, lagged
+from steady_ppl.model.actuation import delayed, lagged, row_spans
 from steady_ppl.model.program import Program
 
 CONTROLS: Need = (lambda program: program.controls, "the program has no controls")
+SUBSTEPS: Need = (lambda program: program.substeps > 1, "it takes a row in one step (fit with --substeps)")
 THRUSTERS: Need = (THRUSTS[0], "there are no controls left and right")
 NO_TWO_THRUSTS: Need = (
     lambda program: {"left", "right"} != set(program.control_names),
@@ -137,6 +138,22 @@ def actuator_delay(self: Program, control: Tensor, time: Tensor, c: Tensor, cont
     occurs: radio links, buses and computers between command and motor
     """
     return control + self.chosen_controls(controls, control) * (delayed(control, time, c) - control)
+
+
+@declare(ACTUATORS, "between", "1", typical=0.5, limit=1.0, sign=1, lacks=needs(CONTROLS, SUBSTEPS))
+def first_order_hold(self: Program, control: Tensor, time: Tensor, c: Tensor) -> Tensor:
+    r"""u → u + c (t - t_mid) du/dt within a row, from the rows beside it
+
+    equation: u(t) = u_k + c\,(t - t_{k + 1/2})\,\frac{u_{k+1} - u_{k-1}}{t_{k + 3/2} - t_{k - 1/2}}
+    feels: is pushed by what changes all the time, where the table has a mean for each row
+    occurs: rows that are means of a faster controller, forces and torques that are measured
+    """
+    spans, count = row_spans(time), self.substeps
+    middle, rise = time + 0.5 * spans, torch.zeros_like(control)
+    apart = (middle[2:] - middle[:-2]).clamp(min=torch.finfo(time.dtype).tiny)
+    rise[1:-1] = (control[2:] - control[:-2]) * (spans[1:-1] / apart).unsqueeze(-1)
+    share = (torch.arange(count, dtype=time.dtype, device=time.device) + 0.5) / count - 0.5
+    return (control.unsqueeze(1) + c * share[:, None, None] * rise.unsqueeze(1)).flatten(0, 1)
 
 
 @_on_controls("1", typical=0.25, limit=1.0, sign=1)
