@@ -29,10 +29,9 @@ from steady_ppl.comparison.scores import (
 from steady_ppl.data.table import refuse_long
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.errors import DataError, UsageError
-from steady_ppl.gaussian.linearize import ReferencePath
+from steady_ppl.gaussian.linearize import ReferencePath, has_heavy_tails
 from steady_ppl.gaussian.predict import suited_horizons
 from steady_ppl.likelihood.outliers import Outliers, find_outliers
-from steady_ppl.likelihood.scores import has_heavy_tails
 from steady_ppl.model.problem import Problem
 from steady_ppl.model.program import Program, for_program
 from steady_ppl.runs.diagnostics import diagnose_units
