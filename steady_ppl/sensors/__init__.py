@@ -3,8 +3,31 @@
 Here live what sensors measure and how precisely. What may be wrong with them is an effect, and lives there.
 """
 
-from steady_ppl.sensors.landmarks import Bearings, Ranges
-from steady_ppl.sensors.on_board import BodyVelocity, Heading, Position, WheelSpeed, YawRate
-from steady_ppl.sensors.sensor import Sensor
+from steady_ppl.sensors.landmarks import Bearings, Ranges, RangesBearings
+from steady_ppl.sensors.on_board import (
+    Accelerometer,
+    BodyVelocity,
+    Encoder,
+    Heading,
+    Pose,
+    Position,
+    WheelSpeed,
+    YawRate,
+)
+from steady_ppl.sensors.sensor import Sensor, Several
 
-__all__ = ["Bearings", "BodyVelocity", "Heading", "Position", "Ranges", "Sensor", "WheelSpeed", "YawRate"]
+__all__ = [
+    "Accelerometer",
+    "Bearings",
+    "BodyVelocity",
+    "Encoder",
+    "Heading",
+    "Pose",
+    "Position",
+    "Ranges",
+    "RangesBearings",
+    "Sensor",
+    "Several",
+    "WheelSpeed",
+    "YawRate",
+]

@@ -1,15 +1,14 @@
 """Sensors that measure the vehicle itself: where it is, where it points, how fast it moves and turns."""
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import torch
 from torch import Tensor
 
-from steady_ppl.errors import ProgramError
 from steady_ppl.model.planar_vehicle import stack, turned
-from steady_ppl.sensors.sensor import Sensor, Setting, setting
+from steady_ppl.sensors.sensor import Sensor, Setting, Several, setting
 
 
 @dataclass(frozen=True)
@@ -26,10 +25,7 @@ class Position(Sensor):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        is_pair = isinstance(self.offset, Sequence) and len(self.offset) == 2
-        if not (self.offset is None or isinstance(self.offset, str) or is_pair):
-            what = f"offset is two numbers, m ahead and to the left, got {self.offset!r}"
-            raise ProgramError(f"sensor {self.name}: {what}", site="sensors")
+        self._require_place("offset")
 
     def columns(self, program: Any) -> tuple[str, ...]:
         return f"{self.name}_x [m]", f"{self.name}_y [m]"
@@ -47,19 +43,54 @@ class Heading(Sensor):
 
     Attributes:
         from_north: it reads from the y axis clockwise, as a compass does where y points north.
+        angle: rad that it is turned anticlockwise on its mount.
     """
 
     from_north: bool = False
+    angle: Setting = 0.0
 
     kind = "heading"
     of_circle = True
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self._require_number("angle")
 
     def columns(self, program: Any) -> tuple[str, ...]:
         return (f"{self.name} [rad]",)
 
     def reading(self, program: Any, state: Tensor) -> Tensor:
-        heading = state[..., 2:3]
+        heading = state[..., 2:3] + setting(program, self.angle, state)
         return 0.5 * math.pi - heading if self.from_north else heading
+
+
+@dataclass(frozen=True, kw_only=True)
+class Pose(Several):
+    """Where its marker is and where that points: motion capture, a tag in a camera's image, scan matching.
+
+    Attributes:
+        sd: of the place, m.
+        heading_sd: rad.
+        offset: the marker's place, m ahead of the tracked point and to its left.
+        angle: rad that the marker is turned anticlockwise on the vehicle.
+    """
+
+    heading_sd: Setting
+    offset: Setting | None = None
+    angle: Setting = 0.0
+
+    kind = "pose"
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self._require_positive("heading_sd")
+        self._require_number("angle")
+        self._require_place("offset")
+
+    @property
+    def parts(self) -> tuple[Sensor, ...]:
+        heading = Heading(self.heading_sd, f"{self.name}_heading", angle=self.angle)
+        return Position(self.sd, self.name, self.offset), heading
 
 
 class YawRate(Sensor):
@@ -74,22 +105,71 @@ class YawRate(Sensor):
         return state[..., 5:6]
 
 
+@dataclass(frozen=True)
 class BodyVelocity(Sensor):
-    """Its velocity ahead and to its left, m/s: a Doppler log, optical flow, two measuring wheels."""
+    """Its velocity ahead and to its left, m/s: a Doppler log, optical flow, two measuring wheels.
+
+    Attributes:
+        angle: rad that it is turned anticlockwise on its mount.
+    """
+
+    angle: Setting = 0.0
 
     kind = "velocity"
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self._require_number("angle")
 
     def columns(self, program: Any) -> tuple[str, ...]:
         return f"{self.name}_forward [m/s]", f"{self.name}_lateral [m/s]"
 
     def reading(self, program: Any, state: Tensor) -> Tensor:
         forward, lateral, _ = program.body_velocity(state)
-        return stack(forward, lateral)
+        return on_mount(program, self.angle, forward, lateral)
 
 
 @dataclass(frozen=True)
-class WheelSpeed(Sensor):
-    """The speed of a wheel over the ground along its own axis, m/s.
+class Accelerometer(Sensor):
+    """Its specific force ahead and to its left, m/s², the mean over the row that ends with the reading.
+
+    A mean is what a logger keeps of a faster sensor, and does not depend on the program's time step. On level ground
+    specific force is acceleration; a slope or a heel of the vehicle adds gravity, which is no part of the reading.
+
+    Attributes:
+        offset: its place, m ahead of the tracked point and to its left.
+        angle: rad that it is turned anticlockwise on its mount.
+    """
+
+    offset: Setting | None = None
+    angle: Setting = 0.0
+
+    kind = "accelerometer"
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self._require_place("offset")
+        self._require_number("angle")
+
+    @property
+    def keeps(self) -> tuple[str, ...]:
+        return ("acceleration",) if self.offset is None else ("acceleration", "turning")
+
+    def columns(self, program: Any) -> tuple[str, ...]:
+        return f"{self.name}_forward [m/s²]", f"{self.name}_lateral [m/s²]"
+
+    def reading(self, program: Any, state: Tensor) -> Tensor:
+        forward, lateral = program.kept(state, "acceleration").unbind(-1)
+        if self.offset is not None:
+            yaw, square = program.kept(state, "turning").unbind(-1)
+            ahead, left = setting(program, self.offset, state).unbind(-1)
+            forward, lateral = forward - yaw * left - square * ahead, lateral + yaw * ahead - square * left
+        return on_mount(program, self.angle, forward, lateral)
+
+
+@dataclass(frozen=True)
+class _OnWheel(Sensor):
+    """A sensor of a wheel, which rolls along the vehicle's own axis.
 
     Attributes:
         left: m that the wheel stands to the left of the tracked point.
@@ -99,16 +179,49 @@ class WheelSpeed(Sensor):
     left: Setting = 0.0
     size: Setting = 1.0
 
-    kind = "wheel speed"
-
     def __post_init__(self) -> None:
         super().__post_init__()
+        self._require_number("left")
         self._require_positive("size")
+
+    def rolled(self, program: Any, ahead: Tensor, turned: Tensor | None, state: Tensor) -> Tensor:
+        """What the wheel makes of the vehicle's movement ahead and of its turn, `(..., 1)`."""
+        left, size = (setting(program, value, state) for value in (self.left, self.size))
+        return ((ahead if turned is None else ahead - left * turned) / size).unsqueeze(-1)
+
+
+class WheelSpeed(_OnWheel):
+    """The speed of a wheel over the ground along its own axis, m/s."""
+
+    kind = "wheel speed"
 
     def columns(self, program: Any) -> tuple[str, ...]:
         return (f"{self.name} [m/s]",)
 
     def reading(self, program: Any, state: Tensor) -> Tensor:
         forward, _, yaw_rate = program.body_velocity(state)
-        left, size = (setting(program, value, state) for value in (self.left, self.size))
-        return ((forward - left * yaw_rate) / size).unsqueeze(-1)
+        return self.rolled(program, forward, yaw_rate, state)
+
+
+class Encoder(_OnWheel):
+    """How far a wheel rolled over the ground since the row before, m."""
+
+    kind = "encoder"
+
+    @property
+    def keeps(self) -> tuple[str, ...]:
+        return ("travelled",) if self.left == 0 else ("travelled", "turned")
+
+    def columns(self, program: Any) -> tuple[str, ...]:
+        return (f"{self.name} [m]",)
+
+    def reading(self, program: Any, state: Tensor) -> Tensor:
+        way, *turn = (program.kept(state, name).squeeze(-1) for name in self.keeps)
+        return self.rolled(program, way, turn[0] if turn else None, state)
+
+
+def on_mount(program: Any, angle: Setting, forward: Tensor, lateral: Tensor) -> Tensor:
+    """A vector in the axes of a sensor that is turned on its mount, `(..., 2)`."""
+    if angle == 0:
+        return stack(forward, lateral)
+    return stack(*turned(-torch.as_tensor(setting(program, angle, forward)).to(forward), forward, lateral))

@@ -10,6 +10,7 @@ from typing import Any, ClassVar
 
 import pyro
 import pyro.distributions as dist
+import torch
 from torch import Tensor
 
 from steady_ppl.errors import ProgramError
@@ -34,6 +35,16 @@ class Sensor(ABC):
     kind: ClassVar[str]  # what is measured
     of_circle: ClassVar[bool] = False  # whether readings are angles
 
+    @property
+    def keeps(self) -> tuple[str, ...]:
+        """What its vehicle keeps of a row for it, see `PlanarVehicle.kept`; its cell of the first row is not read."""
+        return ()
+
+    @property
+    def parts(self) -> tuple[Sensor, ...]:
+        """The sensors in its housing, each with a site of its own; itself where it is one."""
+        return (self,)
+
     def __post_init__(self) -> None:
         if not self.name:
             object.__setattr__(self, "name", self.kind.replace(" ", "_"))
@@ -47,6 +58,18 @@ class Sensor(ABC):
         if isinstance(value, str) or all(isinstance(one, float | int) and 0 < one < math.inf for one in numbers):
             return
         raise ProgramError(f"sensor {self.name}: {what} is a number above zero, got {value!r}", site="sensors")
+
+    def _require_number(self, what: str) -> None:
+        value = getattr(self, what)
+        if not (isinstance(value, str) or (isinstance(value, float | int) and math.isfinite(value))):
+            raise ProgramError(f"sensor {self.name}: {what} is a finite number, got {value!r}", site="sensors")
+
+    def _require_place(self, what: str) -> None:
+        value = getattr(self, what)
+        is_pair = isinstance(value, Sequence) and len(value) == 2 and all(isinstance(one, float | int) for one in value)
+        if not (value is None or isinstance(value, str) or is_pair):
+            expected = f"{what} is two numbers, m ahead and to the left, got {value!r}"
+            raise ProgramError(f"sensor {self.name}: {expected}", site="sensors")
 
     @abstractmethod
     def columns(self, program: Any) -> tuple[str, ...]:
@@ -64,6 +87,20 @@ class Sensor(ABC):
     def observe(self, program: Any, state: Tensor) -> None:
         """Sample its readings at the site of its name."""
         pyro.sample(self.name, self.distribution(program, state))
+
+
+class Several(Sensor):
+    """Sensors in one housing, which are late together; each has its own site, noise and effects."""
+
+    def columns(self, program: Any) -> tuple[str, ...]:
+        return tuple(column for part in self.parts for column in part.columns(program))
+
+    def reading(self, program: Any, state: Tensor) -> Tensor:
+        return torch.cat([part.reading(program, state) for part in self.parts], -1)
+
+    def observe(self, program: Any, state: Tensor) -> None:
+        for part in self.parts:
+            part.observe(program, state)
 
 
 def setting(program: Any, value: Setting, like: Tensor) -> Any:
