@@ -61,14 +61,7 @@ class RangesBearings(Several):
 
     kind = "range and bearing"
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        self._require_positive("bearing_sd")
-
     @property
     def parts(self) -> tuple[Sensor, ...]:
-        return Ranges(self.sd, f"{self._prefix}range"), Bearings(self.bearing_sd, f"{self._prefix}bearing")
-
-    @property
-    def _prefix(self) -> str:
-        return "" if self.name == self.kind.replace(" ", "_") else f"{self.name}_"
+        prefix = "" if self.name == self.kind.replace(" ", "_") else f"{self.name}_"
+        return Ranges(self.sd, f"{prefix}range"), Bearings(self.bearing_sd, f"{prefix}bearing")

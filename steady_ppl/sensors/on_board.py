@@ -23,10 +23,6 @@ class Position(Sensor):
 
     kind = "position"
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        self._require_place("offset")
-
     def columns(self, program: Any) -> tuple[str, ...]:
         return f"{self.name}_x [m]", f"{self.name}_y [m]"
 
@@ -52,10 +48,6 @@ class Heading(Sensor):
     kind = "heading"
     of_circle = True
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        self._require_number("angle")
-
     def columns(self, program: Any) -> tuple[str, ...]:
         return (f"{self.name} [rad]",)
 
@@ -80,12 +72,6 @@ class Pose(Several):
     angle: Setting = 0.0
 
     kind = "pose"
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        self._require_positive("heading_sd")
-        self._require_number("angle")
-        self._require_place("offset")
 
     @property
     def parts(self) -> tuple[Sensor, ...]:
@@ -117,10 +103,6 @@ class BodyVelocity(Sensor):
 
     kind = "velocity"
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        self._require_number("angle")
-
     def columns(self, program: Any) -> tuple[str, ...]:
         return f"{self.name}_forward [m/s]", f"{self.name}_lateral [m/s]"
 
@@ -146,11 +128,6 @@ class Accelerometer(Sensor):
 
     kind = "accelerometer"
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        self._require_place("offset")
-        self._require_number("angle")
-
     @property
     def keeps(self) -> tuple[str, ...]:
         return ("acceleration",) if self.offset is None else ("acceleration", "turning")
@@ -165,59 +142,6 @@ class Accelerometer(Sensor):
             ahead, left = setting(program, self.offset, state).unbind(-1)
             forward, lateral = forward - yaw * left - square * ahead, lateral + yaw * ahead - square * left
         return on_mount(program, self.angle, forward, lateral)
-
-
-@dataclass(frozen=True)
-class _OnWheel(Sensor):
-    """A sensor of a wheel, which rolls along the vehicle's own axis.
-
-    Attributes:
-        left: m that the wheel stands to the left of the tracked point.
-        size: its radius over the one that the encoder takes it to have; the reading is as much smaller.
-    """
-
-    left: Setting = 0.0
-    size: Setting = 1.0
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        self._require_number("left")
-        self._require_positive("size")
-
-    def rolled(self, program: Any, ahead: Tensor, turned: Tensor | None, state: Tensor) -> Tensor:
-        """What the wheel makes of the vehicle's movement ahead and of its turn, `(..., 1)`."""
-        left, size = (setting(program, value, state) for value in (self.left, self.size))
-        return ((ahead if turned is None else ahead - left * turned) / size).unsqueeze(-1)
-
-
-class WheelSpeed(_OnWheel):
-    """The speed of a wheel over the ground along its own axis, m/s."""
-
-    kind = "wheel speed"
-
-    def columns(self, program: Any) -> tuple[str, ...]:
-        return (f"{self.name} [m/s]",)
-
-    def reading(self, program: Any, state: Tensor) -> Tensor:
-        forward, _, yaw_rate = program.body_velocity(state)
-        return self.rolled(program, forward, yaw_rate, state)
-
-
-class Encoder(_OnWheel):
-    """How far a wheel rolled over the ground since the row before, m."""
-
-    kind = "encoder"
-
-    @property
-    def keeps(self) -> tuple[str, ...]:
-        return ("travelled",) if self.left == 0 else ("travelled", "turned")
-
-    def columns(self, program: Any) -> tuple[str, ...]:
-        return (f"{self.name} [m]",)
-
-    def reading(self, program: Any, state: Tensor) -> Tensor:
-        way, *turn = (program.kept(state, name).squeeze(-1) for name in self.keeps)
-        return self.rolled(program, way, turn[0] if turn else None, state)
 
 
 def on_mount(program: Any, angle: Setting, forward: Tensor, lateral: Tensor) -> Tensor:

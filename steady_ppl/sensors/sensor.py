@@ -20,6 +20,26 @@ Setting = float | Sequence[float] | str
 """A number, or the name of one of the program's parameters or constants, which may then be learned."""
 
 
+def _is_number(value: Any) -> bool:
+    return isinstance(value, float | int) and math.isfinite(value)
+
+
+def _is_positive(value: Any) -> bool:
+    numbers = value if isinstance(value, Sequence) else (value,)
+    return all(_is_number(one) and one > 0 for one in numbers)
+
+
+def _is_place(value: Any) -> bool:
+    return value is None or (isinstance(value, Sequence) and len(value) == 2 and all(map(_is_number, value)))
+
+
+_SETTINGS = {
+    **dict.fromkeys(("sd", "heading_sd", "bearing_sd", "size"), (_is_positive, "a number above zero")),
+    **dict.fromkeys(("angle", "left"), (_is_number, "a finite number")),
+    "offset": (_is_place, "two numbers, m ahead and to the left"),
+}
+
+
 @dataclass(frozen=True)
 class Sensor(ABC):
     """A sensor of a vehicle in the plane. A reading that is missing in a row is an empty cell of the table.
@@ -50,26 +70,10 @@ class Sensor(ABC):
             object.__setattr__(self, "name", self.kind.replace(" ", "_"))
         if not (isinstance(self.name, str) and self.name.isidentifier()):
             raise ProgramError(f"a sensor's name is one word, got {self.name!r}", site="sensors")
-        self._require_positive("sd")
-
-    def _require_positive(self, what: str) -> None:
-        value = getattr(self, what)
-        numbers = value if isinstance(value, Sequence) else (value,)
-        if isinstance(value, str) or all(isinstance(one, float | int) and 0 < one < math.inf for one in numbers):
-            return
-        raise ProgramError(f"sensor {self.name}: {what} is a number above zero, got {value!r}", site="sensors")
-
-    def _require_number(self, what: str) -> None:
-        value = getattr(self, what)
-        if not (isinstance(value, str) or (isinstance(value, float | int) and math.isfinite(value))):
-            raise ProgramError(f"sensor {self.name}: {what} is a finite number, got {value!r}", site="sensors")
-
-    def _require_place(self, what: str) -> None:
-        value = getattr(self, what)
-        is_pair = isinstance(value, Sequence) and len(value) == 2 and all(isinstance(one, float | int) for one in value)
-        if not (value is None or isinstance(value, str) or is_pair):
-            expected = f"{what} is two numbers, m ahead and to the left, got {value!r}"
-            raise ProgramError(f"sensor {self.name}: {expected}", site="sensors")
+        for what, value in vars(self).items():
+            holds, expected = _SETTINGS.get(what, (None, ""))
+            if holds and not (isinstance(value, str) or holds(value)):
+                raise ProgramError(f"sensor {self.name}: {what} is {expected}, got {value!r}", site="sensors")
 
     @abstractmethod
     def columns(self, program: Any) -> tuple[str, ...]:

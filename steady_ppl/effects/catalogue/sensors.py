@@ -112,32 +112,28 @@ RATES: Need = (
 )
 
 
-def _each_that_learns_no(setting: str, *kinds: str) -> Callable[[Program, Trajectories | None], list[dict[str, Any]]]:
+def _that_learn_no(setting: str, program: Program, *kinds: str) -> Choices:
     """Every listed sensor of some kinds but those of which the program learns a setting."""
-
-    def choices(program: Program, data: Trajectories | None) -> list[dict[str, Any]]:
-        if not lists_sensors(program):
-            return []
-        learned = {one.name for one in program.sensor_parts if isinstance(getattr(one, setting, None), str)}
-        found = {name: columns for name, columns in sensors_of(program, *kinds).items() if name not in learned}
-        return [{"columns": columns, **at} for at, columns in _named(found)]
-
-    return choices
+    parts = program.sensor_parts if lists_sensors(program) else ()
+    learned = {one.name for one in parts if isinstance(getattr(one, setting, None), str)}
+    found = {name: at for name, at in sensors_of(program, *kinds).items() if parts and name not in learned}
+    return [{"columns": columns, **at} for at, columns in _named(found)]
 
 
-_antennas, _mounted = _each_that_learns_no("offset", "position"), _each_that_learns_no("angle", *MOUNTED)
+def _antennas(program: Program, data: Trajectories | None) -> Choices:
+    return _that_learn_no("offset", program, "position")
 
 
-def _each_in_pose(program: Program, data: Trajectories | None) -> list[dict[str, Any]]:
+def _mounted(program: Program, data: Trajectories | None) -> Choices:
+    return _that_learn_no("angle", program, *MOUNTED)
+
+
+def _each_in_pose(program: Program, data: Trajectories | None) -> Choices:
     """Every listed sensor of some kinds, those in one housing together."""
-    if not lists_sensors(program):
-        return []
-    columns, found = program.sensor_columns, []
-    for one in program.sensors:
-        if one.kind in OF_POSE and all(part.name in columns for part in one.parts):
-            together = tuple(column for part in one.parts for column in columns[part.name])
-            found.append({"columns": together, "sensor": one.name, "at": one.name})
-    return found
+    columns = program.sensor_columns if lists_sensors(program) else {}
+    every = [one for one in program.sensors if one.kind in OF_POSE] if columns else []
+    found = {one.name: [columns.get(part.name, ()) for part in one.parts] for one in every}
+    return [{"columns": sum(at, ()), "sensor": name, "at": name} for name, at in found.items() if all(at)]
 
 
 def _one_by_one(program: Program, columns: Iterable[int]) -> Choices:
