@@ -86,6 +86,9 @@ def kept_columns(kind: Any) -> dict[str, Sequence[str]]:
     listed = kind.sensors if isinstance(kind.sensors, Sequence) else ()
     asked = (getattr(one, "keeps", ()) for one in listed if not isinstance(one, type))
     wanted = dict.fromkeys([*kind.keeps, *(name for names in asked for name in names)])
+    if isinstance(kind.keeps, str):
+        what = f"keeps is the text {kind.keeps!r}; one quantity is ({kind.keeps!r},)"
+        raise ProgramError(f"program {kind.__name__}: {what}", site="keeps")
     for name in wanted:
         if name not in QUANTITIES:
             what = f"keeps names {name!r}; a vehicle can keep {', '.join(QUANTITIES)}"

@@ -321,7 +321,7 @@ def for_program(program: Program, data: Trajectories) -> Trajectories:
         resting = [program.state_names.index(name) for name in program.resting_names]
         chosen.states[0][..., resting] = 0.0
     if later := names(program.since_row_before):
-        chosen.observed[0][..., [program.measurement_names.index(name) for name in later]] = False
+        chosen.observed[0][..., [name in later for name in program.measurement_names]] = False
     parameter = next(program.parameters(), torch.empty(0, device=data.time.device))
     return _within(chosen.to(parameter.dtype, parameter.device))
 

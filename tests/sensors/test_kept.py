@@ -252,6 +252,18 @@ def test_what_cannot_be_kept_is_said() -> None:
     with pytest.raises(st.ProgramError, match="keeps names 'aceleration'; a vehicle can keep acceleration, turning"):
         probe(Typo())
 
+    class Text(type(example("unicycle"))):
+        keeps = "control"
+
+    with pytest.raises(st.ProgramError, match=r"keeps is the text 'control'; one quantity is \('control',\)"):
+        probe(Text())
+
+    class Nothing(type(example("unicycle"))):
+        since_row_before = ("gyr",)
+
+    with pytest.raises(st.ProgramError, match="since_row_before names 'gyr', no measurement"):
+        probe(Nothing())
+
     program = example("car")
     with pytest.raises(st.ProgramError, match="it does not keep 'control': name it in `keeps`"):
         program.kept(torch.zeros(6), "control")
