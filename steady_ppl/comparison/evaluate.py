@@ -233,8 +233,9 @@ def forward(
     assert data.states is not None
     if data.time.shape[0] <= horizon:
         return {}
-    counted = data.rows[horizon:] & torch.isfinite(data.states[:-horizon]).all(-1)
-    origin = torch.where(counted[..., None], data.states[:-horizon], 0.0)
+    begins = [index for index, name in enumerate(program.state_names) if name not in program.kept_names]
+    counted = data.rows[horizon:] & torch.isfinite(data.states[:-horizon, :, begins]).all(-1)
+    origin = torch.where(counted[..., None], data.states[:-horizon], 0.0).nan_to_num()
     sums, counts = defaultdict[str, float](float), defaultdict[str, int](int)
     at_once = max(1, 500_000 // counted.numel())
     for first in range(0, rollouts, at_once):

@@ -33,6 +33,7 @@ class ConstantVelocity(Program):
         self.register_buffer("scales", scales)
         for name in ("states", "controls", "channels", "measurements", "substeps", "angles", "error_groups"):
             setattr(self, name, getattr(program, name))
+        self.kept_names = program.kept_names
         object.__setattr__(self, "of", program)  # not a part of this one: Pyro would rename it
 
     def initial(self) -> Tensor:

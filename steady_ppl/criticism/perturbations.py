@@ -187,7 +187,7 @@ class _Scores:
         """A constant push on each state component that noise reaches."""
         reached = self.linear.noise.square().sum((0, 1, 3)) > 0
         for index, name in enumerate(self.program.state_names):
-            if bool(reached[index]):
+            if bool(reached[index]) and name not in self.program.kept_names:
                 yield f"constant push on {name}", self.over_rows(self.steps * self.arrival[..., index])
 
     def of_couplings(self) -> Named:

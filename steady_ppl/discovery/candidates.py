@@ -52,7 +52,7 @@ MAX_NATS_BEHIND = 25.0  # nats behind the best on the drives of a fold, with whi
 MIN_STATISTIC_TO_RETRY = 20.0  # statistic of a test from which a fit that gains nothing has gone astray
 # forms of effects in proportion to the coefficient
 LINEAR_FORMS = ("push", "command", "history", "between", "measured", "viewpoint")
-OF_MEASUREMENTS = ("measured", "blur")  # forms of effects that act on one column or on a few
+OF_MEASUREMENTS = ("measured", "blur", "tails")  # forms of effects that act on one column or on a few
 UNEXPLAINED = "colour"  # the form of effects that imitate whatever is missing, and may enter when nothing else does
 MIN_GAIN_OF_PLACE = 0.3  # nats by which another knee or place has to be likelier
 MAX_COORDINATE_SWEEPS = 4  # along all knees and places in turns, with steps of one size

@@ -226,7 +226,8 @@ class Scoring:
         at = self.at.measurements
         squares = at.mean.square()
         fourth = squares.square() + 6 * squares * at.variance + 3 * at.variance.square()
-        return torch.where(at.present, (fourth - 2 * (squares + at.variance) - 1) / 4, 0.0).sum((0, -1))
+        slopes = torch.where(at.present, (fourth - 2 * (squares + at.variance) - 1) / 4, 0.0)
+        return slopes[..., list(variant.options.get("columns") or range(slopes.shape[-1]))].sum((0, -1))
 
     def _colour(self, variant: Variant, c: tuple[Tensor, Tensor], width: float) -> Tensor:
         """Of the share of the last deviation that stays, at zero: E[ε(t) ε(t − 1)], in the spreads' ratio."""

@@ -5,8 +5,6 @@ Nothing here knows of data beyond what an effect's choices need, or of how an ef
 
 from steady_ppl.effects.attach import (
     attach,
-    attached,
-    coefficient,
     record,
     restore,
     set_coefficient,
@@ -15,7 +13,7 @@ from steady_ppl.effects.attach import (
     written_class,
 )
 from steady_ppl.effects.codegen import write_program
-from steady_ppl.effects.declaration import Effect, Variant
+from steady_ppl.effects.declaration import Effect, Variant, attached, coefficient
 from steady_ppl.effects.registry import catalogue, chosen_variant, find, not_applicable, of_name, parsed, register
 from steady_ppl.effects.sizes import Sizes
 

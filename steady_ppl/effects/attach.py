@@ -14,7 +14,7 @@ from pyro.distributions import constraints
 from pyro.nn import PyroParam
 from torch import Tensor
 
-from steady_ppl.effects.declaration import Effect, Value, Variant
+from steady_ppl.effects.declaration import Effect, Value, Variant, attached, coefficient, effects_of
 from steady_ppl.effects.registry import chosen_variant, parsed
 from steady_ppl.errors import UsageError
 from steady_ppl.model import interventions
@@ -120,11 +120,6 @@ def _start(variant: Variant, value: Value | None, like: Tensor) -> Tensor:
     return start
 
 
-def attached(program: Program) -> tuple[Variant, ...]:
-    """The effects that a program's class lists or that were added to it, in their order."""
-    return tuple(vars(one)["_attached"] for one in reversed(type(program).__mro__) if "_attached" in vars(one))
-
-
 def written_class(program: Program) -> type[Program]:
     """The class of a program as its file has it, without the effects that `attach` gave it."""
     return next(one for one in type(program).__mro__ if "_attached" not in vars(one))
@@ -143,11 +138,6 @@ def restore(program: Program, effects: Sequence[str]) -> Program:
         if (variant.name, dict(variant.options)) not in have:
             attach(program, variant)
     return program
-
-
-def coefficient(program: Program, variant: Variant) -> Tensor:
-    """The value of an effect's coefficient in a program that has it."""
-    return getattr(program, variant.parameter)
 
 
 def _push(base: Any, variant: Variant) -> Methods:
@@ -185,6 +175,28 @@ def _between(base: Any, variant: Variant) -> Methods:
 def _viewpoint(base: Any, variant: Variant) -> Methods:
     def observe(self: Any, state: Tensor) -> None:
         return base.observe(self, variant(self, state, c=coefficient(self, variant)))
+
+    return {"observe": observe}
+
+
+def _measured(base: Any, variant: Variant) -> Methods:
+    """Where the state is seen as from elsewhere, this effect sees it so too."""
+
+    def observe(self: Any, state: Tensor) -> None:
+        seen = state
+        for other in effects_of(base, "viewpoint"):
+            seen = other(self, seen, c=coefficient(self, other))
+        with interventions.misread(self, partial(variant, self, seen, c=coefficient(self, variant))):
+            return base.observe(self, state)
+
+    return {"observe": observe}
+
+
+def _tails(base: Any, variant: Variant) -> Methods:
+    def observe(self: Any, state: Tensor) -> None:
+        share = variant(self, c=coefficient(self, variant))
+        with interventions.heavy_tailed(share, variant.options.get("columns", ())):
+            return base.observe(self, state)
 
     return {"observe": observe}
 
@@ -240,11 +252,11 @@ _METHODS_OF_FORM: dict[str, Callable[[Any, Variant], Methods]] = {
     "command": _command,
     "history": _history,
     "between": _between,
-    "measured": _under(lambda program, act, state: interventions.misread(program, partial(act, state)), "observe"),
+    "measured": _measured,
     "viewpoint": _viewpoint,
     "spread": _under(_widened, "transition"),
     "blur": _under(lambda program, act, state: interventions.blurred(act(state)), "observe"),
-    "tails": _under(lambda program, act, state: interventions.heavy_tailed(act()), "observe"),
+    "tails": _tails,
     "colour": _colour,
 }
 

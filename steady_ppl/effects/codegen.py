@@ -14,8 +14,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from steady_ppl.effects.attach import attached, coefficient, written_class
-from steady_ppl.effects.declaration import Variant
+from steady_ppl.effects.attach import written_class
+from steady_ppl.effects.declaration import Variant, attached, coefficient
 from steady_ppl.effects.registry import chosen_variant
 from steady_ppl.errors import UsageError
 from steady_ppl.model.loading import load_program

@@ -11,7 +11,7 @@ with the coefficient as `c`. The form says what it takes and returns:
     viewpoint  (self, state, c)                        the state that is measured, (..., D)
     spread     (self, state, control, time, c)         factors on channels' standard deviations: {channel: (...)}
     blur       (self, state, c)                        factors on the measurements' standard deviations, (..., K)
-    tails      (self, c)                               one over the degrees of freedom of the measurement noise
+    tails      (self, c)                               one over the degrees of freedom of the measurement noise, ()
     colour     (self, c)                               share of a channel's last deviation that stays: {channel: (...)}
 """
 
@@ -246,6 +246,22 @@ class Variant:
     def needs_mean(self) -> bool:
         """Whether it depends on what the channels' means are without it."""
         return "mean" in inspect.signature(self.effect.function).parameters
+
+
+def effects_of(kind: type[Program], *forms: str) -> tuple[Variant, ...]:
+    """The effects that a class lists or that were added to it, of some forms or of any, in their order."""
+    every = (vars(one)["_attached"] for one in reversed(kind.__mro__) if "_attached" in vars(one))
+    return tuple(variant for variant in every if not forms or variant.effect.form in forms)
+
+
+def attached(program: Program) -> tuple[Variant, ...]:
+    """The effects that a program's class lists or that were added to it, in their order."""
+    return effects_of(type(program))
+
+
+def coefficient(program: Program, variant: Variant) -> Tensor:
+    """The value of an effect's coefficient in a program that has it."""
+    return getattr(program, variant.parameter)
 
 
 def _unit(program: Program, variant: Variant) -> str:

@@ -176,9 +176,10 @@ def true_paths(program: Program, data: Trajectories) -> Paths:
         DataError: a state is unknown.
         ProgramError: no noise is found within `MAX_GAUSS_NEWTON_STEPS`, or the start is not one site.
     """
-    if (states := data.states) is None or not bool(torch.isfinite(states[data.rows]).all()):
+    own = torch.tensor([name not in program.kept_names for name in program.state_names], device=data.time.device)
+    if (states := data.states) is None or not bool(torch.isfinite(states[data.rows][:, own]).all()):
         raise DataError("supervised learning needs the true state of every row: the table's x. columns are incomplete")
-    states = torch.where(data.rows[..., None], states, states[:1])
+    states = torch.where(data.rows[..., None], states, states[:1]).nan_to_num()  # what is kept follows from the others
     exact, within = copy.deepcopy(program).double(), data.to(torch.float64)
     before, after = states[:-1].double(), states[1:].double()
     inputs = row_inputs(exact, within)
@@ -191,8 +192,8 @@ def true_paths(program: Program, data: Trajectories) -> Paths:
     noise = before.new_zeros(*before.shape[:-1], len(channels))
     for _ in range(MAX_GAUSS_NEWTON_STEPS):
         base, _ = run(noise)
-        effect = torch.stack([run(noise + channel)[0] - base for channel in channels], -1)
-        difference = wrap_angles(after - base, program.angle_indices)
+        effect = torch.stack([run(noise + channel)[0] - base for channel in channels], -1)[..., own, :]
+        difference = wrap_angles(after - base, program.angle_indices)[..., own]
         change = (torch.linalg.pinv(effect) @ difference.unsqueeze(-1)).squeeze(-1)
         noise = noise + change
         if not bool((change.abs() > NOISE_TOLERANCE * (1 + noise.abs())).any()):
@@ -201,7 +202,8 @@ def true_paths(program: Program, data: Trajectories) -> Paths:
         what = "no channel noise was found that leads from one true state to the next"
         why = "(transition bends too much in its noise): supervised learning cannot tell which it was"
         raise ProgramError(f"program {type(program).__name__}: {what} {why}", site="transition")
-    _, moving = run(noise)
+    ends, moving = run(noise)
+    states = torch.cat([states[:1], torch.where(own, states[1:], ends.to(states))])
     with running(1, before.shape[1]), Recording() as start:
         program.initial()
     if len(start.values) != 1:

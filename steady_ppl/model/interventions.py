@@ -4,7 +4,7 @@ with pushed(self, {"forward": -c * velocity}):
     return super().transition(state, control, time, step)
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -83,12 +83,16 @@ def blurred(factors: Tensor) -> Transforming:
     return Transforming(change)
 
 
-def heavy_tailed(share: Tensor) -> Transforming:
-    """Give the measurements' noise the tails of a Student t of 1/`share` degrees of freedom, its scale the normal's."""
+def heavy_tailed(share: Tensor, columns: Sequence[int] = ()) -> Transforming:
+    """Give the measurements' noise the tails of a Student t of 1/`share` degrees of freedom, its scale the normal's; of
+    sites with some `columns` only, where these are named."""
+    chosen = set(columns)
 
     def change(fn: Any, columns: slice) -> Any:
+        if chosen and not chosen & set(range(columns.start, columns.stop)):
+            return fn
         base = unwrapped(fn)
-        kind = WrappedStudentT if isinstance(base, WrappedNormal) else dist.StudentT
+        kind = WrappedStudentT if isinstance(base, WrappedNormal | WrappedStudentT) else dist.StudentT
         return kind((1 / share).expand(base.loc.shape), base.loc, base.scale).to_event(fn.event_dim)
 
     return Transforming(change)

@@ -1,7 +1,7 @@
 """Vehicles in the plane: their state, their step, and the sensors that they list."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import lru_cache
 from typing import Any
 
@@ -12,10 +12,25 @@ from torch import Tensor, nn
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.errors import ProgramError, UsageError
 from steady_ppl.model.distributions import WrappedNormal
+from steady_ppl.model.kept import KEEPING, MOVING, kept_columns
 from steady_ppl.model.program import Program, names
 
 NEAREST = 1e-6  # m, that a landmark is away at least, so that its distance has a slope
 LANDMARK_UNITS = {"bearing": "rad", "range": "m"}  # of measurements that are called so, one a landmark
+
+
+class _OfClass:
+    """What a vehicle's class has by what it keeps."""
+
+    def __init__(self, make: Callable[[Any], tuple[str, ...]]) -> None:
+        self.make = make
+
+    def __get__(self, vehicle: Any, kind: Any) -> tuple[str, ...]:
+        return self.make(kind)
+
+
+def _kept(kind: Any) -> tuple[str, ...]:
+    return tuple(column for columns in kept_columns(kind).values() for column in columns)
 
 
 class PlanarVehicle(Program):
@@ -26,6 +41,8 @@ class PlanarVehicle(Program):
     Attributes:
         landmarks: positions that bearings and ranges are measured to, m.
         sensors: what it carries, of `steady_ppl.sensors`; its measurements and its `observe` are then theirs.
+        keeps: what its own `observe` asks for by `self.kept`, by names of `steady_ppl.model.kept.QUANTITIES`; these and
+            what its sensors keep are states behind the six, which its own `initial` and `transition` do not see.
         bearing_sd: standard deviation of a bearing, rad; 5° unless a program says otherwise, or learns it.
         slips: whether the lateral velocity is free; False where the program takes it back, with the centripetal term
             that a turn needs: `a_lateral = −w / settling + v · yaw_rate`.
@@ -33,9 +50,11 @@ class PlanarVehicle(Program):
             their command, s; None where it is the step.
     """
 
-    states = ("x [m]", "y [m]", "heading [rad]", "vx [m/s]", "vy [m/s]", "yaw_rate [rad/s]")
+    states: Any = _OfClass(lambda kind: (*MOVING, *_kept(kind)))
+    resting: Any = _OfClass(_kept)
+    kept_names: Any = _OfClass(lambda kind: names(_kept(kind)))
     channels = ("forward [m/s²]", "lateral [m/s²]", "yaw [rad/s²]")
-    angles = ("heading",)
+    angles: Any = _OfClass(lambda kind: ("heading", *({"before_heading"} & {*names(_kept(kind))})))
     error_groups = {
         "location": ("x", "y"),
         "angle": ("heading",),
@@ -46,9 +65,22 @@ class PlanarVehicle(Program):
     axes = {"translation": ("forward", "lateral"), "yaw": ("yaw",)}
     landmarks: Sequence[Sequence[float]] = ()
     sensors: Sequence[Any] = ()
+    keeps: Sequence[str] = ()
     bearing_sd: float
     settling: float | None = None
     slips: bool = True
+
+    def __init_subclass__(cls, **options: Any) -> None:
+        super().__init_subclass__(**options)
+        for method, keeping in KEEPING.items():
+            if cls.outermost(method) is vars(cls).get(method):
+                setattr(cls, method, keeping(vars(cls)[method]))
+
+    @classmethod
+    def outermost(cls, method: str) -> Any:
+        """A method as the first class has it that is no program's with an effect."""
+        written = (vars(kind) for kind in cls.__mro__ if "_attached" not in vars(kind))
+        return next(methods[method] for methods in written if method in methods)
 
     def __init__(self) -> None:
         super().__init__()
@@ -64,9 +96,19 @@ class PlanarVehicle(Program):
 
     @property
     def sensor_columns(self) -> Mapping[str, tuple[int, ...]]:
-        """Name of each sensor that it lists → its measurements' indices; a vehicle whose own `observe` leaves some of
+        """Name of each of `sensor_parts` → its measurements' indices; a vehicle whose own `observe` leaves some of
         them out does not carry these."""
-        return self._places({sensor.name: names(sensor.columns(self)) for sensor in self._listed})
+        return self._places({part.name: names(part.columns(self)) for part in self.sensor_parts})
+
+    @property
+    def sensor_parts(self) -> tuple[Any, ...]:
+        """The sensors that it lists, those in one housing one by one."""
+        return tuple(part for sensor in self._listed for part in sensor.parts)
+
+    @property
+    def since_row_before(self) -> tuple[str, ...]:  # type: ignore[override]
+        """The columns of sensors whose readings are of the way from the row before."""
+        return tuple(column for sensor in self._listed if sensor.keeps for column in sensor.columns(self))
 
     def observe(self, state: Tensor) -> None:
         """Sample what its sensors read; a vehicle that lists none has an `observe` of its own."""
@@ -79,11 +121,35 @@ class PlanarVehicle(Program):
     def _listed(self) -> Sequence[Any]:
         """Its sensors; ProgramError where something else is listed."""
         sensors = self.sensors if isinstance(self.sensors, Sequence) else [self.sensors]
-        wrong = [one for one in sensors if isinstance(one, type) or not hasattr(one, "observe")]
+        wrong = [one for one in sensors if isinstance(one, type) or not hasattr(one, "parts")]
         if wrong or not isinstance(self.sensors, Sequence):
             about = f"`sensors` is a list of sensors, as `(Ranges(sd=0.1),)`, got {(wrong or [self.sensors])[0]!r}"
             raise ProgramError(f"program {type(self).__name__}: {about}", site="sensors")
+        if lost := [one for one in sensors if not kept_columns(type(self)).keys() >= {*one.keeps}]:
+            keeps = f"its sensor {lost[0].name} keeps {', '.join(lost[0].keeps)}"
+            about = f"{keeps}: list `sensors` in the body of the class"
+            raise ProgramError(f"program {type(self).__name__}: {about}", site="sensors")
         return sensors
+
+    def kept(self, state: Tensor, quantity: str) -> Tensor:
+        """Something that the vehicle keeps of the row that ends with a state, `(..., n)`; zero in a drive's first row.
+
+        Args:
+            state: `(..., D)`, as `observe` has it.
+            quantity: acceleration: mean forward and lateral one, m/s²; turning: mean yaw acceleration, rad/s², and
+                squared yaw rate, rad²/s²; travelled: way ahead, m; turned: rad; control: the row's, as it acted;
+                before: x, y, heading, vx, vy and yaw_rate in the row before.
+
+        Raises:
+            ProgramError: the vehicle does not keep it.
+        """
+        begins = len(MOVING)
+        for name, columns in kept_columns(type(self)).items():
+            if name == quantity:
+                return state[..., begins : begins + len(columns)]
+            begins += len(columns)
+        about = f"it does not keep {quantity!r}: name it in `keeps`"
+        raise ProgramError(f"program {type(self).__name__}: {about}", site="keeps")
 
     def _places(self, columns: Mapping[str, Sequence[str]]) -> dict[str, tuple[int, ...]]:
         """The indices of measurements by their names, of those that stand side by side."""
@@ -306,7 +372,7 @@ class UnknownMap(PlanarVehicle):
 
     def prepare(self, data: Trajectories, known_start: bool) -> None:
         """Refuse, by UsageError, to learn a map whose frame nothing fixes."""
-        sees_position = any(sensor.kind == "position" for sensor in self._listed)
+        sees_position = any(part.kind == "position" for part in self.sensor_parts)
         if not (known_start or self.surveyed_frame or self.framed_by_start or sees_position):
             raise UsageError(
                 f"program {type(self).__name__}: nothing fixes the frame of its map: give known starts "

@@ -120,6 +120,8 @@ class Program(PyroModule):
         motion: channel → the state components that are its position and its velocity; the generic effects go by it.
         error_groups: what an error is reported for: name → components whose Euclidean norm it is.
         resting: state components that start at zero in every drive; a table need not have them.
+        kept_names: those of them that are begun anew in every row.
+        since_row_before: measurements that the first row of a drive cannot have; cells of the table are passed over.
         effects: effects that the program has besides what it writes out: `("linear_drag=0.1", "slope=0.05,-0.03")`.
         substeps: in how many steps of `transition` the program takes a row; see `steady_ppl.model.substeps`.
 
@@ -142,6 +144,8 @@ class Program(PyroModule):
     motion: Mapping[str, tuple[str, str]] = {}
     error_groups: Mapping[str, Sequence[str]] = {}
     resting: Sequence[str] = ()
+    kept_names: Sequence[str] = ()
+    since_row_before: Sequence[str] = ()
     effects: Sequence[str] = ()
     substeps: int = 1
 
@@ -329,6 +333,8 @@ def for_program(program: Program, data: Trajectories) -> Trajectories:
     if chosen.states is not None and program.resting:
         resting = [program.state_names.index(name) for name in program.resting_names]
         chosen.states[0][..., resting] = 0.0
+    if later := names(program.since_row_before):
+        chosen.observed[0][..., [name in later for name in program.measurement_names]] = False
     parameter = next(program.parameters(), torch.empty(0, device=data.time.device))
     return _within(chosen.to(parameter.dtype, parameter.device))
 

@@ -100,7 +100,7 @@ def is_step(program: Program, data: Trajectories) -> bool:
     """Return whether `transition` moves less and less as `step` gets shorter, in rows of data for the program.
 
     A program that holds something within each step (`-w / step`) or counts rows (`0.8 * state`) does not: in substeps
-    it is another program.
+    it is another program. What is kept of a row, as a mean acceleration, is no part of this.
     """
     if not bool(data.transitions.any()) or counts_rows(program):
         return False
@@ -114,7 +114,8 @@ def is_step(program: Program, data: Trajectories) -> bool:
     (far, pushed_far), (near, pushed_near) = changes
     moves = near <= 0.5 * far + 1e-6 * _largest(state)
     noise = pushed_near <= 0.1 * pushed_far + 1e-6 * _largest(state)
-    return bool(moves.all() and noise.all())
+    of_row = torch.tensor([name in program.kept_names for name in program.state_names], device=state.device)
+    return bool((moves & noise | of_row).all())
 
 
 @torch.no_grad()

@@ -37,8 +37,18 @@ from steady_ppl.utils.context import bound
 MAX_SUBSTEPS = 1000  # of a row
 MIN_SHARE_OF_SD = 0.1  # of a channel in a substep, that it has on average over a row at least
 MIN_SHARE_OF_PUSH = 1e-3  # of a channel's location, that is pushed at least to be seen in 32 bits
-_ROW_ENDS: ContextVar[bool] = ContextVar("row ends", default=True)
-_Part = tuple[tuple[Tensor, Tensor, Tensor], bool]
+_Part = tuple[tuple[Tensor, Tensor, Tensor], "_Place"]
+
+
+class _Place(NamedTuple):
+    """Where in its row a substep is."""
+
+    begins: bool
+    ends: bool
+
+
+_WHOLE_ROW = _Place(begins=True, ends=True)
+_PLACE: ContextVar[_Place] = ContextVar("place in the row", default=_WHOLE_ROW)
 
 
 def with_substeps(program: Program, count: int) -> Program:
@@ -57,7 +67,12 @@ def is_count(value: object) -> bool:
 
 def row_ends() -> bool:
     """Whether the `transition` that runs now is the last one of its row."""
-    return _ROW_ENDS.get()
+    return _PLACE.get().ends
+
+
+def row_begins() -> bool:
+    """Whether the `transition` that runs now is the first one of its row."""
+    return _PLACE.get().begins
 
 
 def advance(program: Program, state: Tensor, control: Tensor, time: Tensor, step: Tensor) -> Tensor:
@@ -74,8 +89,8 @@ def advance(program: Program, state: Tensor, control: Tensor, time: Tensor, step
     """
     if program.substeps == 1:
         return program.transition(state, control, time, step)
-    (first, _), *others = _parts(program, control, time, step)
-    with Recording() as seen, within_row():
+    (first, place), *others = _parts(program, control, time, step)
+    with Recording() as seen, within_row(*place):
         state = program.transition(state, *first)
     noise = {site: standardised(fn, seen.values[site], site) for site, fn in seen.distributions.items()}
     for after, _ in _through(program, state, others, noise):
@@ -98,10 +113,10 @@ def noisy_step(program: Program, state: Tensor, noise: Tensor, control: Tensor, 
 def row_chain(program: Program, state: Tensor, noise: Tensor, control: Tensor, time: Tensor, step: Tensor) -> Chain:
     """Return `noisy_step` of rows `(rows, B, ·)` as a chain of substeps."""
     steps = []
-    for given, ends in _parts(program, control, time, step):
-        name = "the last substep" if ends else "a substep"
+    for given, place in _parts(program, control, time, step):
+        name = "the last substep" if place.ends else "the first substep" if place.begins else "a substep"
         named = dict(zip(("control", "time", "step"), given, strict=True))
-        steps.append(Step(name, partial(_noisy_substep, program, ends), named))
+        steps.append(Step(name, partial(_noisy_substep, program, place), named))
     return Chain(steps, ("state", state), ("noise", noise))
 
 
@@ -198,9 +213,10 @@ def row_controls(program: Program, control: Tensor) -> Tensor:
     return control.unflatten(-1, (program.substeps, controls)).mean(-2)
 
 
-def within_row(ends: bool = False) -> AbstractContextManager[None]:
-    """Run a `transition` as one that no row ends with, so that what counts rows stays as it is; unless it `ends`."""
-    return bound(_ROW_ENDS, ends)
+def within_row(begins: bool = False, ends: bool = False) -> AbstractContextManager[None]:
+    """Run a `transition` as one that no row begins or ends with, so that what counts rows stays as it is; unless it
+    `begins` or `ends` one."""
+    return bound(_PLACE, _Place(begins, ends))
 
 
 @dataclass(eq=False)
@@ -234,16 +250,20 @@ def standardised(fn: Any, value: Tensor, site: str) -> Tensor:
 
 
 def _parts(program: Program, control: Tensor, time: Tensor, step: Tensor) -> Iterator[_Part]:
-    """Control, time and step of every substep, and whether the row ends with it."""
+    """Control, time and step of every substep, and its place in the row.
+
+    Its first one has a place of its own only where the program keeps something of its row: each place is a kernel.
+    """
     count, controls = program.substeps, len(program.controls)
     short = step / count
     held = [control] * count if control.shape[-1] == controls else control.split(controls, -1)
     for index, acting_now in enumerate(held):
-        yield (acting_now, time + index * short, short), index == count - 1
+        begins = index == 0 and bool(program.kept_names)
+        yield (acting_now, time + index * short, short), _Place(begins, index == count - 1)
 
 
-def _noisy_substep(program: Program, ends: bool, state: Tensor, noise: Tensor, *given: Tensor) -> Tensor:
-    with running(*state.shape[:-1]), Standardised(noise), within_row(ends):
+def _noisy_substep(program: Program, place: _Place, state: Tensor, noise: Tensor, *given: Tensor) -> Tensor:
+    with running(*state.shape[:-1]), Standardised(noise), within_row(*place):
         return program.transition(state, *given)
 
 
@@ -276,8 +296,8 @@ def _through(
     program: Program, state: Tensor, parts: Iterable[_Part], noise: Mapping[str, Tensor] | float
 ) -> Iterator[tuple[Tensor, Recording]]:
     """The state after each substep with given noise in scales, and what was sampled in it."""
-    for given, ends in parts:
-        with poutine.block(), Recording() as seen, Held(noise), within_row(ends):
+    for given, place in parts:
+        with poutine.block(), Recording() as seen, Held(noise), within_row(*place):
             state = program.transition(state, *given)
         yield state, seen
 

@@ -91,6 +91,9 @@ def _misdeclared(program: Program) -> Iterator[str]:
         for member in members:
             if member not in known:
                 yield f": {what} names {member!r}, no state component ({', '.join(known)})"
+    if unknown := set(names(program.since_row_before)) - set(program.measurement_names):
+        there = ", ".join(program.measurement_names)
+        yield f": since_row_before names {sorted(unknown)[0]!r}, no measurement ({there})"
     if not is_count(program.substeps):
         yield f": substeps is {program.substeps!r}; expected a whole number from 1 to {MAX_SUBSTEPS}"
     if not (isinstance(program.simulated_step, float | int) and program.simulated_step > 0):

@@ -3,8 +3,10 @@
 Here live what sensors measure and how precisely. What may be wrong with them is an effect, and lives there.
 """
 
-from steady_ppl.sensors.landmarks import Bearings, Ranges
-from steady_ppl.sensors.on_board import BodyVelocity, Heading, Position, WheelSpeed, YawRate
-from steady_ppl.sensors.sensor import Sensor
+from steady_ppl.sensors.landmarks import Bearings, Ranges, RangesBearings
+from steady_ppl.sensors.on_board import Accelerometer, BodyVelocity, Heading, Pose, Position, YawRate
+from steady_ppl.sensors.sensor import Sensor, Several
+from steady_ppl.sensors.wheels import Encoder, WheelSpeed
 
-__all__ = ["Bearings", "BodyVelocity", "Heading", "Position", "Ranges", "Sensor", "WheelSpeed", "YawRate"]
+__all__ = ["Accelerometer", "Bearings", "BodyVelocity", "Encoder", "Heading", "Pose", "Position", "Ranges"]
+__all__ += ["RangesBearings", "Sensor", "Several", "WheelSpeed", "YawRate"]

@@ -1,5 +1,6 @@
 """Sensors that see landmarks, each of them or some in a row."""
 
+from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import pyro.distributions as dist
@@ -8,7 +9,7 @@ from torch import Tensor
 from steady_ppl.errors import ProgramError
 from steady_ppl.model.handlers import mean_reading
 from steady_ppl.model.planar_vehicle import bearings_to
-from steady_ppl.sensors.sensor import Sensor, setting
+from steady_ppl.sensors.sensor import Sensor, Setting, Several, setting
 
 
 class _OfLandmarks(Sensor):
@@ -43,3 +44,24 @@ class Ranges(_OfLandmarks):
 
     def reading(self, program: Any, state: Tensor) -> Tensor:
         return program.ranges(state)
+
+
+@dataclass(frozen=True, kw_only=True)
+class RangesBearings(Several):
+    """Distance and bearing of each of the program's landmarks: a laser scanner, a radar, tags in a camera's image.
+
+    Its columns are called as those of `Ranges` and `Bearings` are, after its own name if it is given one.
+
+    Attributes:
+        sd: of a distance, m.
+        bearing_sd: rad.
+    """
+
+    bearing_sd: Setting
+
+    kind = "range and bearing"
+
+    @property
+    def parts(self) -> tuple[Sensor, ...]:
+        prefix = "" if self.name == self.kind.replace(" ", "_") else f"{self.name}_"
+        return Ranges(self.sd, f"{prefix}range"), Bearings(self.bearing_sd, f"{prefix}bearing")

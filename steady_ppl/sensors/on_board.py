@@ -1,15 +1,14 @@
 """Sensors that measure the vehicle itself: where it is, where it points, how fast it moves and turns."""
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import torch
 from torch import Tensor
 
-from steady_ppl.errors import ProgramError
 from steady_ppl.model.planar_vehicle import stack, turned
-from steady_ppl.sensors.sensor import Sensor, Setting, setting
+from steady_ppl.sensors.sensor import Sensor, Setting, Several, setting
 
 
 @dataclass(frozen=True)
@@ -23,13 +22,6 @@ class Position(Sensor):
     offset: Setting | None = None
 
     kind = "position"
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        is_pair = isinstance(self.offset, Sequence) and len(self.offset) == 2
-        if not (self.offset is None or isinstance(self.offset, str) or is_pair):
-            what = f"offset is two numbers, m ahead and to the left, got {self.offset!r}"
-            raise ProgramError(f"sensor {self.name}: {what}", site="sensors")
 
     def columns(self, program: Any) -> tuple[str, ...]:
         return f"{self.name}_x [m]", f"{self.name}_y [m]"
@@ -47,9 +39,11 @@ class Heading(Sensor):
 
     Attributes:
         from_north: it reads from the y axis clockwise, as a compass does where y points north.
+        angle: rad that it is turned anticlockwise on its mount.
     """
 
     from_north: bool = False
+    angle: Setting = 0.0
 
     kind = "heading"
     of_circle = True
@@ -58,8 +52,31 @@ class Heading(Sensor):
         return (f"{self.name} [rad]",)
 
     def reading(self, program: Any, state: Tensor) -> Tensor:
-        heading = state[..., 2:3]
+        heading = state[..., 2:3] + setting(program, self.angle, state)
         return 0.5 * math.pi - heading if self.from_north else heading
+
+
+@dataclass(frozen=True, kw_only=True)
+class Pose(Several):
+    """Where its marker is and where that points: motion capture, a tag in a camera's image, scan matching.
+
+    Attributes:
+        sd: of the place, m.
+        heading_sd: rad.
+        offset: the marker's place, m ahead of the tracked point and to its left.
+        angle: rad that the marker is turned anticlockwise on the vehicle.
+    """
+
+    heading_sd: Setting
+    offset: Setting | None = None
+    angle: Setting = 0.0
+
+    kind = "pose"
+
+    @property
+    def parts(self) -> tuple[Sensor, ...]:
+        heading = Heading(self.heading_sd, f"{self.name}_heading", angle=self.angle)
+        return Position(self.sd, self.name, self.offset), heading
 
 
 class YawRate(Sensor):
@@ -74,8 +91,15 @@ class YawRate(Sensor):
         return state[..., 5:6]
 
 
+@dataclass(frozen=True)
 class BodyVelocity(Sensor):
-    """Its velocity ahead and to its left, m/s: a Doppler log, optical flow, two measuring wheels."""
+    """Its velocity ahead and to its left, m/s: a Doppler log, optical flow, two measuring wheels.
+
+    Attributes:
+        angle: rad that it is turned anticlockwise on its mount.
+    """
+
+    angle: Setting = 0.0
 
     kind = "velocity"
 
@@ -84,31 +108,44 @@ class BodyVelocity(Sensor):
 
     def reading(self, program: Any, state: Tensor) -> Tensor:
         forward, lateral, _ = program.body_velocity(state)
-        return stack(forward, lateral)
+        return on_mount(program, self.angle, forward, lateral)
 
 
 @dataclass(frozen=True)
-class WheelSpeed(Sensor):
-    """The speed of a wheel over the ground along its own axis, m/s.
+class Accelerometer(Sensor):
+    """Its specific force ahead and to its left, m/s², the mean over the row that ends with the reading.
+
+    A mean is what a logger keeps of a faster sensor, and does not depend on the program's time step. On level ground
+    specific force is acceleration; a slope or a heel of the vehicle adds gravity, which is no part of the reading.
 
     Attributes:
-        left: m that the wheel stands to the left of the tracked point.
-        size: its radius over the one that the encoder takes it to have; the reading is as much smaller.
+        offset: its place, m ahead of the tracked point and to its left.
+        angle: rad that it is turned anticlockwise on its mount.
     """
 
-    left: Setting = 0.0
-    size: Setting = 1.0
+    offset: Setting | None = None
+    angle: Setting = 0.0
 
-    kind = "wheel speed"
+    kind = "accelerometer"
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        self._require_positive("size")
+    @property
+    def keeps(self) -> tuple[str, ...]:
+        return ("acceleration",) if self.offset is None else ("acceleration", "turning")
 
     def columns(self, program: Any) -> tuple[str, ...]:
-        return (f"{self.name} [m/s]",)
+        return f"{self.name}_forward [m/s²]", f"{self.name}_lateral [m/s²]"
 
     def reading(self, program: Any, state: Tensor) -> Tensor:
-        forward, _, yaw_rate = program.body_velocity(state)
-        left, size = (setting(program, value, state) for value in (self.left, self.size))
-        return ((forward - left * yaw_rate) / size).unsqueeze(-1)
+        forward, lateral = program.kept(state, "acceleration").unbind(-1)
+        if self.offset is not None:
+            yaw, square = program.kept(state, "turning").unbind(-1)
+            ahead, left = setting(program, self.offset, state).unbind(-1)
+            forward, lateral = forward - yaw * left - square * ahead, lateral + yaw * ahead - square * left
+        return on_mount(program, self.angle, forward, lateral)
+
+
+def on_mount(program: Any, angle: Setting, forward: Tensor, lateral: Tensor) -> Tensor:
+    """A vector in the axes of a sensor that is turned on its mount, `(..., 2)`."""
+    if angle == 0:
+        return stack(forward, lateral)
+    return stack(*turned(-torch.as_tensor(setting(program, angle, forward)).to(forward), forward, lateral))

@@ -10,6 +10,7 @@ from typing import Any, ClassVar
 
 import pyro
 import pyro.distributions as dist
+import torch
 from torch import Tensor
 
 from steady_ppl.errors import ProgramError
@@ -17,6 +18,26 @@ from steady_ppl.model.distributions import WrappedNormal
 
 Setting = float | Sequence[float] | str
 """A number, or the name of one of the program's parameters or constants, which may then be learned."""
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, float | int) and math.isfinite(value)
+
+
+def _is_positive(value: Any) -> bool:
+    numbers = value if isinstance(value, Sequence) else (value,)
+    return all(_is_number(one) and one > 0 for one in numbers)
+
+
+def _is_place(value: Any) -> bool:
+    return value is None or (isinstance(value, Sequence) and len(value) == 2 and all(map(_is_number, value)))
+
+
+_SETTINGS = {
+    **dict.fromkeys(("sd", "heading_sd", "bearing_sd", "size"), (_is_positive, "a number above zero")),
+    **dict.fromkeys(("angle", "left"), (_is_number, "a finite number")),
+    "offset": (_is_place, "two numbers, m ahead and to the left"),
+}
 
 
 @dataclass(frozen=True)
@@ -34,19 +55,25 @@ class Sensor(ABC):
     kind: ClassVar[str]  # what is measured
     of_circle: ClassVar[bool] = False  # whether readings are angles
 
+    @property
+    def keeps(self) -> tuple[str, ...]:
+        """What its vehicle keeps of a row for it, see `PlanarVehicle.kept`; its cell of the first row is not read."""
+        return ()
+
+    @property
+    def parts(self) -> tuple[Sensor, ...]:
+        """The sensors in its housing, each with a site of its own; itself where it is one."""
+        return (self,)
+
     def __post_init__(self) -> None:
         if not self.name:
             object.__setattr__(self, "name", self.kind.replace(" ", "_"))
         if not (isinstance(self.name, str) and self.name.isidentifier()):
             raise ProgramError(f"a sensor's name is one word, got {self.name!r}", site="sensors")
-        self._require_positive("sd")
-
-    def _require_positive(self, what: str) -> None:
-        value = getattr(self, what)
-        numbers = value if isinstance(value, Sequence) else (value,)
-        if isinstance(value, str) or all(isinstance(one, float | int) and 0 < one < math.inf for one in numbers):
-            return
-        raise ProgramError(f"sensor {self.name}: {what} is a number above zero, got {value!r}", site="sensors")
+        for what, value in vars(self).items():
+            holds, expected = _SETTINGS.get(what, (None, ""))
+            if holds and not (isinstance(value, str) or holds(value)):
+                raise ProgramError(f"sensor {self.name}: {what} is {expected}, got {value!r}", site="sensors")
 
     @abstractmethod
     def columns(self, program: Any) -> tuple[str, ...]:
@@ -64,6 +91,20 @@ class Sensor(ABC):
     def observe(self, program: Any, state: Tensor) -> None:
         """Sample its readings at the site of its name."""
         pyro.sample(self.name, self.distribution(program, state))
+
+
+class Several(Sensor):
+    """Sensors in one housing, which are late together; each has its own site, noise and effects."""
+
+    def columns(self, program: Any) -> tuple[str, ...]:
+        return tuple(column for part in self.parts for column in part.columns(program))
+
+    def reading(self, program: Any, state: Tensor) -> Tensor:
+        return torch.cat([part.reading(program, state) for part in self.parts], -1)
+
+    def observe(self, program: Any, state: Tensor) -> None:
+        for part in self.parts:
+            part.observe(program, state)
 
 
 def setting(program: Any, value: Setting, like: Tensor) -> Any:

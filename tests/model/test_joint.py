@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from contextlib import ExitStack
 from dataclasses import replace
 
 import pyro
@@ -10,14 +9,11 @@ import pyro.distributions as dist
 import pytest
 import torch
 from examples import drives, example
-from oracles import START_MEAN, START_SD, Stored, all_at_once
+from oracles import START_MEAN, START_SD, Stored, all_at_once, step_by_step
 from pyro import poutine
 from pyro.infer import Trace_ELBO
-from torch import Tensor
 
-from steady_ppl import Joint, Paths, Program, Trajectories, particle_filter, seeded, stack
-from steady_ppl.model.handlers import Observing, Replaying
-from steady_ppl.model.substeps import sample_row
+from steady_ppl import Joint, Paths, Program, particle_filter, seeded, stack
 
 PROGRAMS = (
     "linear_gaussian",
@@ -38,40 +34,6 @@ def prepared(name: str) -> Program:
             if name.startswith("neural"):
                 parameter.normal_(0, 0.2)
     return program
-
-
-def step_by_step(program: Program, data: Trajectories, paths: Paths, *, known_start: bool = False) -> Tensor:
-    """The same sum with one call a row, on plain tensors and with the lengths counted by hand."""
-    draws, rows, trajectories, _ = paths.states.shape
-
-    def density(method, *handlers) -> tuple[Tensor, Tensor]:
-        with ExitStack() as stack:
-            for dim, size in enumerate((trajectories, 1, draws), start=1):
-                stack.enter_context(pyro.plate(f"dim_{dim}", size, dim=-dim))
-            for handler in handlers:
-                stack.enter_context(handler)
-            trace = poutine.trace(method).get_trace()
-        trace.compute_log_prob()
-        sites = [site for site in trace.nodes.values() if site["type"] == "sample" and "log_prob" in site]
-        logs = [s["log_prob"] for s in sites if not isinstance(s["fn"], pyro.poutine.subsample_messenger._Subsample)]
-        return sum(log.expand(draws, 1, trajectories) for log in logs), trace.nodes["_RETURN"]["value"]
-
-    total = torch.zeros(draws, 1, trajectories, dtype=torch.float64)
-    start, state = density(program.initial, Replaying(paths.start))
-    if not known_start:
-        total = total + start
-    for row in range(rows):
-        inside = row < data.lengths
-        observing = Observing(data.measurements[row, None], data.observed[row, None])
-        seen, _ = density(lambda: program.observe(state), observing)  # noqa: B023
-        total = total + torch.where(inside, seen, 0.0)
-        if row < rows - 1:
-            noise = {site: value[:, row, None] for site, value in paths.noise.items()}
-            at = data.controls[row, None], data.elapsed[row, None], data.steps[row, None]
-            moved, state = density(lambda: sample_row(program, state, *at), Replaying(noise))  # noqa: B023
-            state = state.detach()  # a path is given: in substeps a row's end would follow the parameters a little
-            total = total + torch.where(row + 1 < data.lengths, moved, 0.0)
-    return total.sum()
 
 
 @pytest.mark.slow

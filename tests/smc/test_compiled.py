@@ -11,7 +11,7 @@ import pyro.distributions as dist
 import pytest
 import torch
 from examples import drives, example
-from kernel_programs import EXAMPLES, HovercraftTruth, Stale, Switching, single
+from kernel_programs import EXAMPLES, HovercraftTruth, Stale, Switching, assert_same, both, single
 from oracles import assert_mean
 from scipy import stats
 
@@ -22,33 +22,10 @@ from steady_ppl.kernels import jit
 from steady_ppl.model.handlers import Recording, running
 from steady_ppl.model.problem import Problem
 from steady_ppl.smc import compiled, loops
-from steady_ppl.smc.compiled import CompiledFilter, compiled_filter, standard_normal
+from steady_ppl.smc.compiled import CompiledFilter, standard_normal
 from steady_ppl.smc.proposal import Proposal, Steered
-from steady_ppl.smc.resampling import stratified, systematic, take
+from steady_ppl.smc.resampling import stratified, take
 from steady_ppl.smc.stepping import Stepping
-
-
-def both(program, data, particles: int = 40, weight: float | torch.Tensor = 0.7):
-    """Its kernels and its own lines, and some states."""
-    states = 2 * torch.randn(particles, len(data), len(program.states))
-    plain = Stepping(program, data, weight)
-    machine = compiled_filter(plain, states, Proposal(), systematic)
-    assert isinstance(machine, CompiledFilter), machine
-    return machine, plain, states
-
-
-def assert_same(machine: CompiledFilter, plain: Stepping, states: torch.Tensor, row: int = 2) -> None:
-    uniform = torch.rand(*states.shape[:2], machine.methods.uniforms)
-    moved, values, ratio = machine.transition(row, states, uniform)
-    expected, sites = plain.transition(row, states, standard_normal(uniform, machine.methods.channels)[0])
-    assert (ratio == 0).all() and machine.methods.event_dims == plain.event_dims
-    torch.testing.assert_close(moved, expected, rtol=1e-4, atol=2e-5)
-    parts = values.split([machine.methods.sizes[site] for site in sites], -1)
-    for value, (site, theirs) in zip(parts, sites.items(), strict=True):
-        value = value if plain.event_dims[site] else value[..., 0]
-        torch.testing.assert_close(value, theirs.expand_as(value), rtol=1e-4, atol=2e-5)
-    density = plain.log_density(row, states)
-    torch.testing.assert_close(machine.log_density(row, states)[..., 0], density, rtol=1e-4, atol=2e-3)
 
 
 @pytest.mark.parametrize("name", EXAMPLES)

@@ -63,9 +63,14 @@ NOISE: list[Effect] = []
 _noise = partial(declare, NOISE)
 
 
-@_noise("tails", "1", typical=1 / 3, limit=0.5, sign=1, between=(0.0, 0.49))
-def heavy_tails(self: Program, c: Tensor) -> Tensor:
-    r"""Student t measurement noise with ν = 1/c degrees of freedom
+def _all_or_one(program: Program, data: Trajectories | None) -> Choices:
+    listed = each_sensor()(program, data) if lists_sensors(program) else []
+    return [{}, *(one for one in listed if "at" in one)]
+
+
+@_noise("tails", "1", typical=1 / 3, limit=0.5, sign=1, between=(0.0, 0.49), choices=_all_or_one)
+def heavy_tails(self: Program, c: Tensor, columns: Columns = ()) -> Tensor:
+    r"""Student t measurement noise with ν = 1/c degrees of freedom, of all measurements or of one sensor
 
     equation: y \sim t_\nu,\quad c = 1/\nu
     feels: now and then a measurement is far off

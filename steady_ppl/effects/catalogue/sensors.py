@@ -9,13 +9,16 @@ from torch import Tensor
 
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.effects.catalogue.forces import PLANAR
-from steady_ppl.effects.declaration import Choices, Effect, Need, declare, needs
+from steady_ppl.effects.declaration import Choices, Effect, Need, coefficient, declare, effects_of, needs
 from steady_ppl.model.planar_vehicle import PlanarVehicle, turned
 from steady_ppl.model.program import Program
 
 SEES_LANDMARKS = ("bearing", "range")  # kinds of sensors
-SCALED = ("bearing", "range", "velocity", "wheel speed", "yaw rate")  # kinds whose readings may be too large
-OF_POSE = ("bearing", "range", "position", "heading")  # kinds whose readings a moment ago follow from the state
+# kinds whose readings may be too large
+SCALED = ("bearing", "range", "velocity", "wheel speed", "yaw rate", "accelerometer", "encoder")
+MOUNTED = ("velocity", "accelerometer")  # kinds that read components in their own axes
+# kinds whose readings a moment ago follow from the state
+OF_POSE = ("bearing", "range", "position", "heading", "pose", "range and bearing")
 
 
 def sensors_of(program: Program, *kinds: str) -> dict[str, tuple[int, ...]]:
@@ -29,7 +32,7 @@ def sensors_of(program: Program, *kinds: str) -> dict[str, tuple[int, ...]]:
         seen = program.landmark_columns
         return {kind: seen[kind] for kind in seen if not kinds or kind in kinds}
     columns = program.sensor_columns
-    of_kinds = [one.name for one in program.sensors if not kinds or one.kind in kinds]
+    of_kinds = [one.name for one in program.sensor_parts if not kinds or one.kind in kinds]
     return {name: columns[name] for name in of_kinds if name in columns}
 
 
@@ -92,12 +95,16 @@ WITH_SCALE: Need = (
 )
 LISTED: Need = (lists_sensors, "the program lists no `sensors`")
 POSE: Need = (
-    lambda program: sensors_of(program, *OF_POSE),
+    lambda program: _each_in_pose(program, None),
     "what its sensors read a moment ago does not follow from the state",
 )
 ANTENNA: Need = (
     lambda program: _antennas(program, None),
     "no position is measured by a listed sensor (`sensors`) whose offset is not learned",
+)
+MOUNT: Need = (
+    lambda program: _mounted(program, None),
+    "no velocity or acceleration is measured by a listed sensor (`sensors`) whose angle is not learned",
 )
 RATES: Need = (
     lambda program: program.derivatives,
@@ -105,17 +112,28 @@ RATES: Need = (
 )
 
 
-def _antennas(program: Program, data: Trajectories | None) -> Choices:
-    """Every listed position but those whose offset the program learns."""
-    if not lists_sensors(program):
-        return []
-    learned = {one.name for one in program.sensors if isinstance(getattr(one, "offset", None), str)}
-    found = {name: columns for name, columns in sensors_of(program, "position").items() if name not in learned}
+def _that_learn_no(setting: str, program: Program, *kinds: str) -> Choices:
+    """Every listed sensor of some kinds but those of which the program learns a setting."""
+    parts = program.sensor_parts if lists_sensors(program) else ()
+    learned = {one.name for one in parts if isinstance(getattr(one, setting, None), str)}
+    found = {name: at for name, at in sensors_of(program, *kinds).items() if parts and name not in learned}
     return [{"columns": columns, **at} for at, columns in _named(found)]
 
 
+def _antennas(program: Program, data: Trajectories | None) -> Choices:
+    return _that_learn_no("offset", program, "position")
+
+
+def _mounted(program: Program, data: Trajectories | None) -> Choices:
+    return _that_learn_no("angle", program, *MOUNTED)
+
+
 def _each_in_pose(program: Program, data: Trajectories | None) -> Choices:
-    return [{"columns": columns, "sensor": name, "at": name} for name, columns in sensors_of(program, *OF_POSE).items()]
+    """Every listed sensor of some kinds, those in one housing together."""
+    columns = program.sensor_columns if lists_sensors(program) else {}
+    every = [one for one in program.sensors if one.kind in OF_POSE] if columns else []
+    found = {one.name: [columns.get(part.name, ()) for part in one.parts] for one in every}
+    return [{"columns": sum(at, ()), "sensor": name, "at": name} for name, at in found.items() if all(at)]
 
 
 def _one_by_one(program: Program, columns: Iterable[int]) -> Choices:
@@ -208,6 +226,18 @@ def antenna_offset(self: Program, state: Tensor, measured: Tensor, c: Tensor, co
     return measured + beside(moved, columns, measured.shape[-1])
 
 
+@_on_readings("rad", typical=0.1, limit=0.8, choices=_mounted, lacks=needs(MOUNT))
+def mounting_angle(self: Program, state: Tensor, measured: Tensor, c: Tensor, columns: Columns) -> Tensor:
+    r"""y → R(-c) y, one velocity or acceleration
+
+    equation: y \to R(-c)\,y
+    feels: reads a sideways movement when it goes straight on
+    occurs: a Doppler log, a camera or an IMU that is turned on its mount
+    """
+    own = measured[..., list(columns)]
+    return measured + beside(torch.stack(turned(-c, *own.unbind(-1)), -1) - own, columns, measured.shape[-1])
+
+
 @_on_readings("s", typical=0.1, limit=1.0, choices=_each_in_pose, lacks=needs(LISTED, POSE))
 def sensor_delay(self: Program, state: Tensor, measured: Tensor, c: Tensor, columns: Columns, sensor: str) -> Tensor:
     r"""y(t) → y(t - c), one sensor
@@ -217,8 +247,13 @@ def sensor_delay(self: Program, state: Tensor, measured: Tensor, c: Tensor, colu
     occurs: images that are processed before they are stamped, receivers that filter, messages that wait
     """
     (late,) = (one for one in self.sensors if one.name == sensor)
-    change = late.reading(self, self.earlier(state, c)) - late.reading(self, state)
-    return measured + beside(change, columns, measured.shape[-1])
+    before = self.earlier(state, c)
+    measured = measured + beside(late.reading(self, before) - late.reading(self, state), columns, measured.shape[-1])
+    for other in effects_of(type(self), "measured"):
+        if other.effect.name != "sensor_delay" and set(other.options.get("columns", ())) & set(columns):
+            there, here = (other(self, at, measured, c=coefficient(self, other)) for at in (before, state))
+            measured = measured + (there - here)
+    return measured
 
 
 @declare(SENSORS, "viewpoint", "s", typical=0.12, limit=1.0, lacks=needs(RATES))
