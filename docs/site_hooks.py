@@ -16,7 +16,7 @@ LINKS = {
     "CHANGELOG.md": "changelog.md",
     "SECURITY.md": "security.md",
 }
-PAGES = {name: source for source, name in LINKS.items()}
+PAGES = {name: source for source, name in LINKS.items()} | {"benchmarks/README.md": "benchmarks/README.md"}
 CODE = re.compile(r"(```.*?```|`[^`\n]*`)", re.DOTALL)
 
 
@@ -35,7 +35,8 @@ def on_page_markdown(markdown: str, page, config, files) -> str:
     """Links as they are on the site, and formulas."""
     text = re.sub(r"\]\(docs/", "](", markdown) if page.file.src_uri in PAGES else markdown
     text = re.sub(r"\]\((?:\.\./)+(models/[^)]*)\)", r"](\1)", text)
-    text = re.sub(r"\[([^\]]*)\]\((?:models|LICENSE)[^)]*\)", r"\1", text)  # files of the repository, not of the site
+    for here in (r"(?:models|LICENSE)[^)]*", r"[^)]*\.(?:ipynb|jsonl)"):  # files of the repository, not of the site
+        text = re.sub(rf"\[([^\]]*)\]\({here}\)", r"\1", text)
     depth = page.file.src_uri.count("/")
     for source, name in LINKS.items():
         text = re.sub(rf"\]\((?:\.\./)*{source}", f"]({'../' * depth}{name}", text)

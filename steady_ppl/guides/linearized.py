@@ -135,8 +135,8 @@ class LookaheadGuide(LinearizedGuide, FilteringGuide):
     Args:
         particles: N, for each trajectory.
         resample_below: share of N under which the effective sample size triggers resampling.
-        untwisted, tempered: see `Twist`.
-        program, draws, tempering, known_start, passes, search_again: see `LinearizedGuide`.
+
+    All others are arguments of `Twist` or of `LinearizedGuide`.
     """
 
     def __init__(

@@ -1,4 +1,4 @@
-"""What is filed under benchmarks/results is what the records give, and the README says the same."""
+"""What is filed under benchmarks/results is what the records give, and the page of results says the same."""
 
 from __future__ import annotations
 
@@ -34,13 +34,13 @@ def test_the_filed_tables_are_those_of_the_filed_records(records: list[Record]) 
     assert tables(records) == (RESULTS / "paper.md").read_text()
 
 
-def test_the_readme_shows_the_short_tables() -> None:
-    filed, readme = (file.read_text() for file in (RESULTS / "paper.md", ROOT / "README.md"))
+def test_the_page_shows_the_short_tables() -> None:
+    filed, page = (file.read_text() for file in (RESULTS / "paper.md", ROOT / "docs" / "results-paper.md"))
     parts = [part for part in filed.split("### ") if part.startswith("In short")]
     assert len(parts) == 2
     for part in parts:
         _, rows = part.split("\n\n", 1)
-        assert rows.count("\n| ") >= 9 and rows.strip() in readme
+        assert rows.count("\n| ") >= 9 and rows.strip() in page
 
 
 def test_the_filed_choices_are_those_of_the_filed_records() -> None:

@@ -76,7 +76,7 @@ class Installed:
 
 FEWER = {"fit": "--steps 4", "check": "--simulations 20", "discover": "--simulations 50"}
 FEWER |= {"evaluate": "--rollouts 20", "states": "--draws 10", "report": "--simulations 20"}
-FEWER |= dict.fromkeys(("simulate", "add", "prove", "effects"), "")
+FEWER |= dict.fromkeys(("simulate", "doctor", "add", "prove", "effects"), "")
 
 
 @pytest.fixture(scope="module")
@@ -111,10 +111,10 @@ def test_the_wheel_is_enough(installed: Installed, tmp_path: Path) -> None:
 
 
 @pytest.mark.exhaustive
-def test_every_command_of_the_readme_runs_from_the_wheel(installed: Installed, tmp_path: Path) -> None:
+def test_every_command_of_the_readme_and_of_its_page_runs_from_the_wheel(installed: Installed, tmp_path: Path) -> None:
     installed.run("steady init lab", tmp_path)
     lab, done = tmp_path / "lab", set()
-    for words in commands(ROOT / "README.md"):
+    for words in [*commands(ROOT / "README.md"), *commands(ROOT / "docs" / "cli.md")]:
         if words[0] == "demo":
             installed.run(f"python -c {shlex.quote(SMALL_DEMO)}", lab)
         elif words[0] != "init":

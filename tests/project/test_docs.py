@@ -22,7 +22,7 @@ PAGES = [*sorted(DOCS.glob("*.md")), ROOT / "README.md", ROOT / "CONTRIBUTING.md
 RUN = (
     "own-effect",
     "own-recipe",
-    *(pytest.param(name, marks=pytest.mark.slow) for name in ("own-data", "own-sensor", "control")),
+    *(pytest.param(name, marks=pytest.mark.slow) for name in ("cli", "own-data", "own-sensor", "control")),
     pytest.param("own-program", marks=pytest.mark.exhaustive),
 )
 
@@ -39,16 +39,19 @@ def test_every_command_parses(page: Path) -> None:
         command.make_context(name, rest)
 
 
-def test_the_readme_shows_every_command_or_points_at_it() -> None:
-    text = (ROOT / "README.md").read_text()
-    assert [one.name for one in app.registered_commands if f"steady {one.name}" not in text] == []
+def test_the_readme_points_at_the_page_that_has_every_command() -> None:
+    text = (DOCS / "cli.md").read_text()
+    names = [one.name for one in (*app.registered_commands, *app.registered_groups)]
+    assert [name for name in names if f"`steady {name}`" not in text] == []
+    assert "](docs/cli.md)" in (ROOT / "README.md").read_text()
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", RUN)
 def test_the_examples_of_a_page_run(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """In a folder as `steady init` makes it, a namespace for the page; blocks with a title are files."""
-    (tmp_path / "models").symlink_to(ROOT / "models")
+    for room in ("models", "inference"):
+        (tmp_path / room).symlink_to(ROOT / room)
     for seed, table in enumerate(("train", "valid", "test")):
         st.write_table(simulated(rows=21, seed=seed), tmp_path / f"{table}.csv")
     monkeypatch.chdir(tmp_path)
@@ -109,7 +112,16 @@ def test_every_effect_says_where_it_is_met() -> None:
     assert [effect.name for effect in catalogue() if not effect.occurs] == []
 
 
+def anchors(page: Path) -> set[str]:
+    """Those of a page's headings."""
+    text = re.sub(r"^```.*?^```$", "", page.read_text(), flags=re.MULTILINE | re.DOTALL)
+    titles = re.findall(r"^#+ (.+)$", text, re.MULTILINE)
+    return {re.sub(r"[-\s]+", "-", re.sub(r"[^\w\s-]", "", title).strip().lower()) for title in titles}
+
+
 def test_links_lead_somewhere() -> None:
-    for page in PAGES:
-        for link in re.findall(r"\]\(([^)#\s]+)(?:#[^)]*)?\)", page.read_text()):
-            assert link.startswith("http") or (page.parent / link).exists(), f"{page.name}: {link}"
+    for page in [*PAGES, *sorted((ROOT / "benchmarks").rglob("*.md"))]:
+        for link, _, anchor in re.findall(r"\]\(([^)#\s]*)(#([^)\s]*))?\)", page.read_text()):
+            target = page.parent / link if link else page
+            assert link.startswith("http") or target.exists(), f"{page.name}: {link}"
+            assert target.suffix != ".md" or not anchor or anchor in anchors(target), f"{page.name}: {link}#{anchor}"
