@@ -12,13 +12,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 PX4_TYPES = {"uint64_t": "u8", "int32_t": "i4", "float": "f4", "double": "f8", "uint8_t": "u1", "bool": "u1"}
-PACKED = {"B": "B", "h": "h", "H": "H", "i": "i", "I": "I", "f": "f", "d": "d", "q": "q", "Q": "Q", "n": "4s"} | {
-    "N": "16s",
-    "Z": "64s",
-    "c": "h",
-    "L": "i",
-    "a": "64s",
-}
+PACKED = {char: char for char in "bBhHiIfdqQ"} | {"n": "4s", "N": "16s", "Z": "64s", "a": "64s", "M": "B"}
+PACKED |= {"c": "h", "C": "H", "e": "i", "E": "I", "L": "i"}
 
 
 class Sent(NamedTuple):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -69,16 +70,22 @@ def every(seconds: float, world: World, first: float = 0.0) -> np.ndarray:
 
 
 def px4(
-    world: World, *, seed: int = 0, noise: tuple[float, float, float] = (0, 0, 0), old: bool = False, **more
+    world: World,
+    *,
+    seed: int = 0,
+    noise: Numbers = (0, 0, 0),
+    old: bool = False,
+    armed: Sequence[tuple[float, float]] = ((0.0, 1e9),),
+    delay: np.ndarray | int = 0,
+    fix: np.ndarray | int = 3,
+    extra: bytes = b"",
 ) -> bytes:
     """A ULog. GPS at 10 Hz, two receivers, the second a metre east; attitude at 20 Hz, sampled 3 to 23 ms before it is
     logged; commands at 50 Hz as normalised outputs, of speeds of 4 m/s and steering angles of .5 rad, NaN where it is
     not armed. `noise` are standard deviations, m, rad and rad/s; `armed` spans, s; `delay` that of GPS, µs."""
     dice = np.random.default_rng(seed)
     gps, quick, driven = every(0.1, world), every(0.05, world), every(0.02, world)
-    latitude, longitude = geodetic(
-        world.x[gps] + noise[0] * dice.normal(size=len(gps)), _noisy(world.y[gps], noise[0], dice)
-    )
+    latitude, longitude = geodetic(_noisy(world.x[gps], noise[0], dice), _noisy(world.y[gps], noise[0], dice))
     _, other = geodetic(world.x[gps] + 1.0, world.y[gps])
     late = dice.integers(3000, 23000, len(quick))
     received = gps * 1000 + BOOT + delay

@@ -65,7 +65,7 @@ def read_dataflash(path: Path) -> Log:
     for number, kind in kinds.items():
         records = _records(kind, data)
         instance = marks.get(number, "I")
-        which = records[instance] if instance in kind.divisors and records[instance].dtype.kind in "iu" else None
+        which = records[instance] if instance in kind.divisors and records[instance].dtype == np.uint8 else None
         for value in (None if which is None else np.unique(which).tolist()) or [None]:
             some = records if value is None else records[which == value]
             topics[f"{kind.name}[{value}]" if value else kind.name] = _topic(kind, some)

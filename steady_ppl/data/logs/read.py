@@ -170,7 +170,9 @@ def _fields(topic: Topic, column: LogColumn, where: str) -> list[str]:
     found = next((names for names in choices if all(name in topic.fields for name in names)), None)
     if found is None:
         missing = next(name for name in choices[0] if name not in topic.fields)
-        raise DataError(f"{where}: {column.topic} has no field {missing}; {instead(missing, topic.numeric)}")
+        is_array = f"{missing}[0]" in topic.fields
+        hint = f"name an element, such as {missing}[0]" if is_array else instead(missing, topic.numeric)
+        raise DataError(f"{where}: {column.topic} has no field {missing}; {hint}")
     if text := [name for name in found if name not in topic.numeric]:
         raise DataError(f"{where}: expected a number, {text[0]} is text")
     return found
@@ -206,6 +208,9 @@ def _spans(log: Log, mapping: LogMapping, begin: float | None, end: float | None
     """Where rows may be, ns; None for everywhere."""
     first = log.start + round((begin or 0.0) * 1e9)
     last = log.end if end is None else log.start + round(end * 1e9)
+    if first > log.end or last < log.start:
+        asked = f"from {begin or 0:g} s{'' if end is None else f' to {end:g} s'}"
+        raise DataError(f"{log.name}: it has {(log.end - log.start) / 1e9:.3f} s, nothing of it is {asked}")
     whole = None if begin is None and end is None else [(first, last)]
     if mapping.arming is None:
         return whole

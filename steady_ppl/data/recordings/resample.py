@@ -59,8 +59,13 @@ def in_rows(series: Sequence[Series], step: float, name: str = "bag", within: Sp
     ends = np.min([end[np.searchsorted(first, starts, side="right") - 1] for first, end in known], 0).clip(max=last)
     spans = list(zip(starts.tolist(), ends.tolist(), strict=True))
     if within is not None:
-        spans = [(max(a, c), min(b, d)) for a, b in spans for c, d in within]
+        spans = [(max(a, c), b if b <= d else _last_row(max(a, c), d, step)) for a, b in spans for c, d in within]
     return [_piece(series, start, end, step, name) for start, end in spans if start <= end]
+
+
+def _last_row(start: int, end: int, step: float) -> int:
+    """The time of the last row that is not after an end."""
+    return start + round((end - start) // (step * 1e9) * step * 1e9)
 
 
 def _stretches(control: Series, last: int) -> tuple[np.ndarray, np.ndarray]:

@@ -25,6 +25,7 @@ from steady_ppl.errors import DataError, SteadyError, UsageError
 from steady_ppl.utils.files import require_file
 from steady_ppl.utils.text import one_line
 
+ALIGNED_KEY = 'clock = "aligned"  # its header says when it was made; leave out for the time of arrival'
 TEXT_TYPES = ("string", "wstring", "wchar")
 
 
@@ -277,25 +278,16 @@ def entries(bag: Bag) -> list[Entry]:
     found = []
     for topic, at in arrivals.items():
         types, times = bag.types(topic), np.array(at, dtype=np.int64)
-        about, fields, keys = " and ".join(types), list[str](), list[str]()
+        about = " and ".join(types)
         if missing := next(filter(None, (undefined_type(bag.store, one) for one in types)), None):
             remark = f'{missing} is not defined: name its file, messages = ["PACKAGE/msg/NAME.msg"], in the mapping'
             found.append(Entry(topic, about, times, remark=remark))
-            continue
-        if len(types) == 1:
+        elif len(types) > 1:
+            found.append(Entry(topic, about, times))
+        else:
             fields = list(numeric_fields(bag.store, types[0], first.get(topic)))
-            if has_stamp(bag.store, types[0]):
-                keys = ['clock = "aligned"  # its header says when it was made; leave out for the time of arrival']
-        found.append(
-            Entry(
-                topic,
-                about,
-                times,
-                fields if len(types) > 1 else fields or ["no number"],
-                list(filter(_is_value, fields)),
-                keys,
-            )
-        )
+            keys = [ALIGNED_KEY] if has_stamp(bag.store, types[0]) else []
+            found.append(Entry(topic, about, times, fields or ["no number"], list(filter(_is_value, fields)), keys))
     return found
 
 
