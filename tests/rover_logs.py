@@ -82,7 +82,8 @@ def px4(
 ) -> bytes:
     """A ULog. GPS at 10 Hz, two receivers, the second a metre east; attitude at 20 Hz, sampled 3 to 23 ms before it is
     logged; commands at 50 Hz as normalised outputs, of speeds of 4 m/s and steering angles of .5 rad, NaN where it is
-    not armed. `noise` are standard deviations, m, rad and rad/s; `armed` spans, s; `delay` that of GPS, µs."""
+    not armed, the second motor's against the steering; and as setpoints of an acceleration, north and east, and a rate.
+    `noise` are standard deviations, m, rad and rad/s; `armed` spans, s; `delay` that of GPS, µs."""
     dice = np.random.default_rng(seed)
     gps, quick, driven = every(0.1, world), every(0.05, world), every(0.02, world)
     latitude, longitude = geodetic(_noisy(world.x[gps], noise[0], dice), _noisy(world.y[gps], noise[0], dice))
@@ -109,7 +110,8 @@ def px4(
         return Sent(name, stamps | {"timestamp_sample": ("uint64_t", quick * 1000 + BOOT)} | fields)
 
     motors, servos = np.full((len(driven), 12), np.nan), np.full((len(driven), 8), np.nan)
-    motors[:, 0], servos[:, 0] = outputs.T
+    motors[:, :2], servos[:, 0] = outputs * [1, -1], outputs[:, 1]
+    setpoints = np.concatenate([world.commands[driven], np.zeros((len(driven), 1))], 1)
     when = {"timestamp": ("uint64_t", driven * 1000 + BOOT)}
     topics = [
         fixes(longitude, 0),
@@ -118,6 +120,8 @@ def px4(
         sampled("vehicle_angular_velocity", xyz=("float", np.stack([0 * turning, 0 * turning, -turning], -1))),
         Sent("actuator_motors", when | {"control": ("float", motors)}),
         Sent("actuator_servos", when | {"control": ("float", servos)}),
+        Sent("vehicle_local_position_setpoint", when | {"acceleration": ("float", setpoints)}),
+        Sent("vehicle_rates_setpoint", when | {"yaw": ("float", setpoints[:, 1])}),
         Sent(
             "vehicle_status",
             {

@@ -59,7 +59,7 @@ class _Kind:
 def read_dataflash(path: Path) -> Log:
     """Read a log as far as it is whole; DataError where nothing of it can be read."""
     data = path.read_bytes()
-    kinds, notes = _scan(data, path.name)
+    kinds, damaged, left = _scan(data, path.name)
     marks = _instance_fields(kinds, data)
     topics: dict[str, Topic] = {}
     for number, kind in kinds.items():
@@ -70,11 +70,19 @@ def read_dataflash(path: Path) -> Log:
             some = records if value is None else records[which == value]
             topics[f"{kind.name}[{value}]" if value else kind.name] = _topic(kind, some)
     start, end = span(topics)
-    return Log(path.name, "ArduPilot DataFlash", topics, start, end, notes)
+    notes = []
+    if damaged:
+        where, lost = counted(len(damaged), "place"), counted(sum(damaged), "byte")
+        notes.append(f"it is damaged in {where}: {lost} there are no message and are not read")
+    if left:
+        what = f"the last {counted(left, 'byte')} are not read"
+        notes.append(f"it is cut short or damaged at its end, after {(end - start) / 1e9:.3f} s: {what}")
+    return Log(path.name, "ArduPilot DataFlash", topics, start, end, tuple(notes))
 
 
-def _scan(data: bytes, name: str) -> tuple[dict[int, _Kind], tuple[str, ...]]:
-    """The types of messages by number, with where theirs lie; and what of the file is none."""
+def _scan(data: bytes, name: str) -> tuple[dict[int, _Kind], list[int], int]:
+    """The types of messages by number, with where theirs lie; how many bytes are none at each damaged place, and at
+    the end."""
     kinds: dict[int, _Kind] = {FMT: _kind("FMT", "BBnNZ", "Type,Length,Name,Format,Columns")}
     lengths = [0] * 256
     lengths[FMT] = FMT_LENGTH
@@ -99,13 +107,7 @@ def _scan(data: bytes, name: str) -> tuple[dict[int, _Kind], tuple[str, ...]]:
         good = at
     if len(kinds) == 1:
         raise DataError(f"{name}: cannot be read, it defines no message (FMT); is it damaged or cut short?")
-    notes = []
-    if damage:
-        where = counted(len(damage), "place")
-        notes.append(f"it is damaged in {where}: {counted(sum(damage), 'byte')} there are no message and are not read")
-    if good < end:
-        notes.append(f"it is cut short or damaged at its end: the last {counted(end - good, 'byte')} are not read")
-    return kinds, tuple(notes)
+    return kinds, damage, end - good
 
 
 def _goes_on(data: bytes, at: int) -> bool:

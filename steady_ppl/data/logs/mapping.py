@@ -17,7 +17,8 @@ from steady_ppl.utils.schema import NUMBER, TEXT, mismatch
 READY_FOLDER = Path(__file__).with_name("ready")
 READY = tuple(sorted(file.stem for file in READY_FOLDER.glob("*.toml")))
 SIGNS = {">=": operator.ge, "<=": operator.le, "==": operator.eq, "!=": operator.ne, ">": operator.gt, "<": operator.lt}
-CONDITION = re.compile(rf"\s*(?P<field>{FIELD})\s*(?P<sign>{'|'.join(SIGNS)})\s*(?P<number>[-+.\deE]+)\s*", re.ASCII)
+DECIMAL = r"[-+]?\d+(\.\d*)?([eE][-+]?\d+)?"
+CONDITION = re.compile(rf"\s*(?P<field>{FIELD})\s*(?P<sign>{'|'.join(SIGNS)})\s*(?P<number>{DECIMAL})\s*", re.ASCII)
 FIELDS = rf"{FIELD}( {FIELD})*"
 COUNTS = {"east": (2,), "north": (2,), "yaw": (1, 4), "yaw from north": (1, 4)}  # of fields; of other readings one
 
@@ -33,11 +34,10 @@ class Condition(NamedTuple):
     def parse(cls, text: object) -> Condition:
         """The condition that `fix_type >= 3` spells; UsageError where it is not spelt so."""
         found = CONDITION.fullmatch(text) if isinstance(text, str) else None
-        try:
-            return cls(found["field"], found["sign"], float(found["number"])) if found else cls("", "", float(""))
-        except ValueError:
+        if found is None:
             signs = ", ".join(SIGNS)
-            raise UsageError(f"{text!r} is no condition: expected FIELD SIGN NUMBER, the sign one of {signs}") from None
+            raise UsageError(f"{text!r} is no condition: expected FIELD SIGN NUMBER, the sign one of {signs}")
+        return cls(found["field"], found["sign"], float(found["number"]))
 
     def holds(self, values: np.ndarray) -> np.ndarray:
         """Where the values of the field are so."""

@@ -46,7 +46,7 @@ def read_logs(
         paths: .ulg and .bin files.
         mapping: which field becomes which column.
         say: is told what is damaged, what was left out and which clocks were moved; by default on stderr.
-        begin, end: s from the first message of each log; rows are only between them.
+        begin, end: s from the start of each log; rows are only between them.
 
     Raises:
         DataError: naming the log and, where they apply, the column, the topic and the field.
@@ -60,7 +60,7 @@ def read_logs(
         nonlocal frame
         log = open_log(file)
         for note in log.notes:
-            say(f"{log.name}: {note}; it goes on to {(log.end - log.start) / 1e9:.3f} s")
+            say(f"{log.name}: {note}")
         series, spans, said = [], _spans(log, mapping, begin, end, say), set[str]()
         for column in mapping.columns:
             if frame is None and column.reading in ("east", "north"):

@@ -51,7 +51,9 @@ def read_ulog(path: Path) -> Log:
     if not topics:
         raise DataError(f"{path.name}: cannot be read, it has no message; is it damaged or cut short?")
     start, end = span(topics)
-    return Log(path.name, "PX4 ULog", topics, start, end, tuple(_notes(found, file.left)))
+    if 0 < found.start_timestamp * 1000 < end:
+        start = found.start_timestamp * 1000  # the first messages of topics may be far older than the log
+    return Log(path.name, "PX4 ULog", topics, start, end, tuple(_notes(found, file.left, (end - start) / 1e9)))
 
 
 def _joined(topic: Topic, more: dict[str, np.ndarray]) -> Topic:
@@ -60,12 +62,12 @@ def _joined(topic: Topic, more: dict[str, np.ndarray]) -> Topic:
     return Topic(fields, CLOCKS, {})
 
 
-def _notes(found: Any, left: int) -> list[str]:
+def _notes(found: Any, left: int, seconds: float) -> list[str]:
     notes = []
     if found.file_corruption:
         notes.append("it is damaged: what pyulog could make no message of is not read")
     if left:
-        notes.append(f"it is cut short: the last {counted(left, 'byte')} are not read")
+        notes.append(f"it is cut short after {seconds:.3f} s: the last {counted(left, 'byte')} are not read")
     if found.dropouts:
         lost = sum(dropout.duration for dropout in found.dropouts) / 1e3
         notes.append(f"in {counted(len(found.dropouts), 'place')}, {lost:.3f} s in all, it was not logged (dropouts)")

@@ -84,6 +84,24 @@ def test_commands_of_an_autopilot_are_in_metres_and_radians(tmp_path: Path) -> N
 
 
 @pytest.mark.parametrize(
+    ("name", "expected"),
+    [
+        ("px4-boat", {"left": (1, 2.0), "right": (0, 0.25)}),
+        ("px4-multicopter-plane", {"east": (1, 1.0), "north": (0, 1.0), "turn": (1, -1.0)}),
+        ("ardupilot-boat", {"left": (1, -2.0), "right": (0, 0.25)}),
+    ],
+)
+def test_other_ready_mappings_take_the_controls_that_they_say(tmp_path: Path, name: str, expected: dict) -> None:
+    """Of which command, and how many times it."""
+    log = written(tmp_path / "drive", ardupilot(TRUTH) if name.startswith("a") else px4(TRUTH))
+    data = read_logs([log], ready(name), lambda line: None)
+    assert set(data.control_names) == set(expected)
+    for control, (which, factor) in expected.items():
+        truth = factor * TRUTH.commands[:20000:100, which]
+        np.testing.assert_allclose(column(data, control)[:200], truth, rtol=0, atol=1e-3)
+
+
+@pytest.mark.parametrize(
     ("content", "topic", "field"),
     [(px4, "vehicle_gps_position", "latitude_deg longitude_deg"), (ardupilot, "GPS", "Lat Lng")],
 )
@@ -270,11 +288,17 @@ def test_a_topic_that_a_log_begins_anew_goes_on(tmp_path: Path) -> None:
     np.testing.assert_array_equal(column(taken(log, Y), "a"), [1, 2, 3])
 
 
+def test_seconds_count_from_where_a_ulog_starts(tmp_path: Path) -> None:
+    """The first message of a topic may be older."""
+    log = written(tmp_path / "d.ulg", ulog([sent([0.5, 10.0, 10.1, 10.2, 10.3], [0, 1, 2, 3, 4])], start=10_000_000))
+    np.testing.assert_array_equal(column(taken(log, Y, begin=0.1, end=0.2), "a"), [2, 3])
+
+
 def test_dropouts_are_said(tmp_path: Path) -> None:
     log = written(tmp_path / "d.ulg", ulog([sent([0.1, 0.2], [1, 2])], extra=dropout(30) + dropout(1200)))
     said: list[str] = []
     taken(log, Y, say=said.append)
-    assert said == ["d.ulg: in 2 places, 1.230 s in all, it was not logged (dropouts); it goes on to 0.100 s"]
+    assert said == ["d.ulg: in 2 places, 1.230 s in all, it was not logged (dropouts)"]
 
 
 def test_pyulog_that_is_missing_is_named(tmp_path: Path, monkeypatch, refused) -> None:
