@@ -8,6 +8,7 @@ takes one pass over the headers, keeps where messages lie, and copies the fields
 Source: ArduPilot, libraries/AP_Logger/README.md and LogStructure.h.
 """
 
+from array import array
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -53,7 +54,7 @@ class _Kind:
     name: str
     record: np.dtype
     divisors: dict[str, float]
-    at: list[int] = field(default_factory=list)
+    at: "array[int]" = field(default_factory=lambda: array("q"))  # bytes from the beginning of the log
 
 
 def read_dataflash(path: Path) -> Log:
