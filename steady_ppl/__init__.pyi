@@ -3,6 +3,8 @@ from .comparison.prove import prove as prove
 from .comparison.result import Proof as Proof
 from .criticism.check import check as check
 from .criticism.result import Check as Check
+from .data.logs.mapping import LogColumn as LogColumn, LogMapping as LogMapping
+from .data.logs.read import read_logs as read_logs
 from .data.rosbag.mapping import BagColumn as BagColumn, BagMapping as BagMapping
 from .data.rosbag.read import read_bags as read_bags
 from .data.table import (

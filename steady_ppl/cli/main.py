@@ -59,6 +59,13 @@ add_command(
     "                            --map y.range=/range:range --step 0.1 --out drive.csv",
 )
 add_command(
+    make.import_log,
+    "Turn PX4 and ArduPilot logs into a table.",
+    "steady import-log drive.ulg px4-rover --out drive.csv",
+    "steady import-log *.bin mapping.toml --from 30 --to 600 --out drives.csv",
+    "steady import-log ardupilot-boat > mapping.toml",
+)
+add_command(
     make.simulate,
     "Simulate drives of a program.",
     "steady simulate models/hovercraft.py --trajectories 16 --out train.csv",

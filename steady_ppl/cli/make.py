@@ -1,9 +1,10 @@
-"""`steady init`, `simulate`, `import-bag` and `data`: folders and tables to work with."""
+"""`steady init`, `simulate`, `import-bag`, `import-log` and `data`: folders and tables to work with."""
 
 import shlex
+from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
 import typer
 
@@ -13,6 +14,11 @@ from steady_ppl.cli.common import program_from
 from steady_ppl.errors import UsageError
 from steady_ppl.utils.progress import stages
 from steady_ppl.utils.text import say, tell
+
+if TYPE_CHECKING:
+    from steady_ppl.data.recordings.mapping import TableMapping
+
+Mapped = TypeVar("Mapped", bound="TableMapping")
 
 NEXT_COMMANDS = (
     "steady fit models/hovercraft.py train.csv --valid valid.csv --known-start --recipe likelihood --out runs/first",
@@ -31,58 +37,115 @@ def init(folder: Annotated[Path, typer.Argument(metavar="DIR", help="The folder 
     tell("\n".join(["", "next:", f"  cd {shlex.quote(str(folder))}", *(f"  {line}" for line in NEXT_COMMANDS)]))
 
 
+Out = Annotated[Path | None, typer.Option("--out", help="Table to write, .csv or .parquet.")]
+Maps = Annotated[
+    list[str] | None,
+    typer.Option("--map", metavar="COLUMN=TOPIC:FIELD[,KEY=VALUE...]", help="One more column; as often as needed."),
+]
+Step = Annotated[float | None, typer.Option(help="Seconds between rows; before that of MAPPING.toml.")]
+
+
 def import_bag(
     arguments: Annotated[
         list[Path],
         typer.Argument(metavar="BAG... [MAPPING.toml]", help="ROS 1 .bag, ROS 2 folder or .mcap; then what to take."),
     ],
-    out: Annotated[Path | None, typer.Option("--out", help="Table to write, .csv or .parquet.")] = None,
-    column: Annotated[
-        list[str] | None,
-        typer.Option("--map", metavar="COLUMN=TOPIC:FIELD[,KEY=VALUE...]", help="One more column; as often as needed."),
-    ] = None,
-    step: Annotated[float | None, typer.Option(help="Seconds between rows; before that of MAPPING.toml.")] = None,
+    out: Out = None,
+    column: Maps = None,
+    step: Step = None,
 ) -> None:
     """Turn ROS bags into a table; without a mapping, list what is in them and print one to start from."""
-    from steady_ppl.data.rosbag.reader import listing, open_bag
-    from steady_ppl.data.table import require_table_file
+    from steady_ppl.data.recordings.listing import listing
+    from steady_ppl.data.rosbag.reader import entries, open_bag
 
     bags = [path for path in arguments if path.suffix != ".toml"]
     files = [path for path in arguments if path.suffix == ".toml"]
     if not bags or len(files) > 1:
         raise UsageError("import-bag needs at least one BAG and at most one MAPPING.toml")
-    if not files and not column:
-        if out is not None or step is not None:
-            raise UsageError("name what to take from the bag, by MAPPING.toml or --map; without --out it is listed")
+    if (place := _place(files, column, out, step, "bag")) is None:
         with ExitStack() as opened:
-            tell(listing([opened.enter_context(open_bag(path)) for path in bags]))
+            found = [opened.enter_context(open_bag(path)) for path in bags]
+            tell(listing([(bag.name, entries(bag)) for bag in found]))
         return
+    mapping = _mapping(st.BagMapping, files, column, step)
+    _written(place, lambda: st.read_bags(bags, mapping))
+
+
+def import_log(
+    arguments: Annotated[
+        list[Path],
+        typer.Argument(metavar="LOG... [MAPPING]", help="PX4 .ulg or ArduPilot .bin; then a .toml or a ready mapping."),
+    ],
+    out: Out = None,
+    column: Maps = None,
+    step: Step = None,
+    begin: Annotated[float | None, typer.Option("--from", help="Seconds of each log to leave out at first.")] = None,
+    end: Annotated[float | None, typer.Option("--to", help="Seconds of each log after which nothing is read.")] = None,
+) -> None:
+    """Turn PX4 and ArduPilot logs into a table; without a mapping, list what is in them.
+
+    Ready mappings: px4-rover, px4-boat, px4-multicopter-plane, ardupilot-rover, ardupilot-rover-commands,
+    ardupilot-boat. One alone is printed, to start from.
+    """
+    from steady_ppl.data.logs.log import entries
+    from steady_ppl.data.logs.mapping import READY, READY_FOLDER
+    from steady_ppl.data.logs.read import open_log
+    from steady_ppl.data.recordings.listing import listing
+
+    files = [path for path in arguments if path.suffix == ".toml" or str(path) in READY]
+    logs = [path for path in arguments if path not in files]
+    if not logs and [*map(str, files)] == [str(arguments[0])] and str(files[0]) in READY and out is None:
+        tell((READY_FOLDER / f"{files[0]}.toml").read_text(encoding="utf-8"), end="")
+        return
+    if not logs or len(files) > 1:
+        raise UsageError(f"import-log needs at least one LOG and at most one mapping: a .toml, or {', '.join(READY)}")
+    if (place := _place(files, column, out, step, "log")) is None:
+        tell(listing([(f"{log.name}  {log.format}", entries(log)) for log in map(open_log, logs)]))
+        return
+    mapping = _mapping(st.LogMapping, files, column, step)
+    _written(place, lambda: st.read_logs(logs, mapping, begin=begin, end=end))
+
+
+def _place(files: list[Path], maps: list[str] | None, out: Path | None, step: float | None, kind: str) -> Path | None:
+    """Where a recording is imported to, None where it is listed; UsageError where it is not said what of it, or where
+    to."""
+    if not files and not maps:
+        if out is not None or step is not None:
+            what = "MAPPING.toml or --map" if kind == "bag" else "a mapping or --map"
+            raise UsageError(f"name what to take from the {kind}, by {what}; without --out it is listed")
+        return None
     if out is None:
         raise UsageError("name the table to write: --out TABLE")
-    mapping = _mapping(files[0] if files else None, column or [], step)
+    return out
+
+
+def _written(out: Path, read: "Callable[[], st.Trajectories]") -> None:
+    """Write the table that is read, and say what is in it."""
+    from steady_ppl.data.table import require_table_file
+
     require_table_file(out)
-    data = st.read_bags(bags, mapping)
+    data = read()
     st.write_table(data, out)
     rows, many, counts = int(data.lengths.sum()), len(data), data.observed.sum((0, 1)).tolist()
     seen = ", ".join(f"y.{name} in {count}" for name, count in zip(data.measurement_names, counts, strict=True))
     tell(f"{out}: {many} trajector{'y' if many == 1 else 'ies'}, {rows} rows, {seen}")
 
 
-def _mapping(file: Path | None, maps: list[str], step: float | None) -> "st.BagMapping":
+def _mapping(kind: "type[Mapped]", files: list[Path], maps: list[str] | None, step: float | None) -> "Mapped":
     """What a file, `--map` and `--step` say together."""
-    from steady_ppl.data.rosbag.mapping import parse_map, read_mapping
+    from steady_ppl.data.recordings.mapping import parse_map
 
-    content: dict[str, Any] = read_mapping(file) if file else {}
+    content: dict[str, Any] = kind.content(files[0]) if files else {}
     if step is not None:
         content["step"] = step
     columns = content.setdefault("columns", {})
-    for text in maps:
+    for text in maps or []:
         name, said = parse_map(text)
         if isinstance(columns, dict):  # else the mapping is refused
             if name in columns:
                 raise UsageError(f"--map {text}: column {name} is given twice")
             columns[name] = said
-    return st.BagMapping.parse(content, file.name if file else "--map")
+    return kind.parse(content, files[0].name if files else "--map")
 
 
 app = typer.Typer(no_args_is_help=True, rich_markup_mode=None)

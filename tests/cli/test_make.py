@@ -231,13 +231,14 @@ def test_the_command_cuts_and_says_what_it_left_out(tmp_path, capsys):
     assert not (tmp_path / "no.csv").exists()
 
 
-# --- import-bag -------------------------------------------------------------------------------------------------------
+# --- import-bag, import-log -------------------------------------------------------------------------------------------
 
 
-def test_help_waits_for_neither_torch_nor_rosbags() -> None:
+@pytest.mark.parametrize("command", ["import-bag", "import-log"])
+def test_help_waits_for_neither_torch_nor_rosbags(command: str) -> None:
     code = (
         "import sys; from steady_ppl.cli.main import main\n"
-        "assert main(['import-bag', '--help']) == 0\n"
+        f"assert main(['{command}', '--help']) == 0\n"
         "print(sorted({'torch', 'rosbags', 'pandas', 'numpy'} & sys.modules.keys()))"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

@@ -14,9 +14,12 @@ from pathlib import Path
 from bag_drives import drive
 from bag_writing import KINDS, write_bag
 from examples import MODELS
+from rover_logs import ardupilot, px4, world
 from small import simulated, steady, written
 from small_studies import UNFITTED, written as write_study
 from truck_logs import command_log, pose_log, write as write_logs
+
+from steady_ppl.data.logs.mapping import READY_FOLDER
 
 FEW = ("--guide", "bootstrap", "--particles", "20", "--draws", "3", "--steps", "4", "--set", "validate_every=2")
 SEARCH = ("discover", "before", "t.csv", "--valid", "v.csv", "--simulations", "50", "--out")
@@ -60,6 +63,7 @@ class Desk:
             written(self.good / name, simulated("linear_gaussian", 10, 9, seed))
         written(self.good / "h.csv", simulated(trajectories=5, rows=9))
         self._write_bags()
+        self._write_autopilot_logs()
         (self.good / "logs").mkdir()
         write_logs(self.good / "logs", pose_log(), command_log())
         self.must("fit", CART, "t.csv", "--recipe", "hand", "--out", "before")
@@ -95,6 +99,12 @@ class Desk:
         (self.good / "mapping.toml").write_text(MAPPING)
         (self.good / "boat_msgs" / "msg").mkdir(parents=True)
         (self.good / "boat_msgs" / "msg" / "Battery.msg").write_text("float64 volt\nstring name\nfloat32[3] gains\n")
+
+    def _write_autopilot_logs(self) -> None:
+        """One of each format, and a mapping."""
+        (self.good / "px4.ulg").write_bytes(px4(world(1.0)))
+        (self.good / "ardupilot.bin").write_bytes(ardupilot(world(1.0)))
+        (self.good / "mine.toml").write_text((READY_FOLDER / "ardupilot-rover.toml").read_text())
 
     def _stop_a_search(self) -> None:
         """Kill it as soon as it has kept three pieces."""

@@ -84,6 +84,10 @@ ON_BAG = """
 import-bag {bag} mapping.toml --out out/drives.csv
 import-bag {bag}
 """
+ON_LOG = """
+import-log {log} {mapping} --out out/drives.parquet
+import-log {log}
+"""
 ON_STUDY = """
 study study.toml --workers 1 --out studied
 plot-study studied --out out/study.png
@@ -121,6 +125,9 @@ KINDS = (
     Kind("mcap/mcap.mcap", BYTES, commands(ON_BAG, bag="mcap")),
     Kind("mcap_file.mcap", BYTES, commands(ON_BAG, bag="mcap_file.mcap")),
     Kind("sqlite/metadata.yaml", BYTES, commands(ON_BAG, bag="sqlite")),
+    Kind("px4.ulg", BYTES, commands(ON_LOG, log="px4.ulg", mapping="px4-rover")),
+    Kind("ardupilot.bin", BYTES, commands(ON_LOG, log="ardupilot.bin", mapping="mine.toml")),
+    Kind("mine.toml", TOML | BYTES, commands(ON_LOG, log="ardupilot.bin", mapping="mine.toml")[:1]),
     Kind("mapping.toml", TOML | BYTES, MAPPED),
     Kind("boat_msgs/msg/Battery.msg", DEFINITION | BYTES, MAPPED),
     Kind("logs/vrpn-pose.csv", LOGS | BYTES, LOG),

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 import typer
+from rover_logs import px4, world
 from small import blocks, commands, simulated
 
 import steady_ppl as st
@@ -22,6 +23,7 @@ PAGES = [*sorted(DOCS.glob("*.md")), ROOT / "README.md", ROOT / "CONTRIBUTING.md
 RUN = (
     "own-effect",
     "own-recipe",
+    "import-log",
     *(pytest.param(name, marks=pytest.mark.slow) for name in ("cli", "own-data", "own-sensor", "control")),
     pytest.param("own-program", marks=pytest.mark.exhaustive),
 )
@@ -54,9 +56,11 @@ def test_the_examples_of_a_page_run(name: str, tmp_path: Path, monkeypatch: pyte
         (tmp_path / room).symlink_to(ROOT / room)
     for seed, table in enumerate(("train", "valid", "test")):
         st.write_table(simulated(rows=21, seed=seed), tmp_path / f"{table}.csv")
+    (tmp_path / "drive.ulg").write_bytes(px4(world(10.0)))
     monkeypatch.chdir(tmp_path)
     program = []
-    for about, text in blocks(DOCS / f"{name}.md", "python"):
+    page = DOCS / f"{name}.md"
+    for about, text in [*blocks(page, "toml"), *blocks(page, "python")]:
         titled = re.search(r'title="([^"]+)"', about)
         if titled:
             (tmp_path / titled[1]).write_text(text)

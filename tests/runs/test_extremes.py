@@ -86,6 +86,7 @@ def test_more_memory_than_there_is_is_one_line(tmp_path: Path, monkeypatch, refu
         ("init", LONG),
         ("demo", "--out", LONG),
         ("import-bag", LONG),
+        ("import-log", LONG),
         ("data", "alpha-truck", LONG, "--out", "new.csv"),
         ("data", "cut", f"{LONG}.csv", "--seconds", 1, "--out", "new.csv"),
     ],

@@ -21,14 +21,13 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-import pandas as pd
 
+from steady_ppl.data.recordings.resample import Series, align
+from steady_ppl.data.recordings.trajectories import Reading, read_each, series_of
 from steady_ppl.data.rosbag.mapping import BagColumn, BagMapping
 from steady_ppl.data.rosbag.reader import Bag, bag_name, check_field, has_stamp, open_bag, stamp_of, value_at
-from steady_ppl.data.rosbag.resample import EvenRows, Series, align, in_rows, long_holds
-from steady_ppl.data.table import from_frame
 from steady_ppl.data.trajectories import Trajectories
-from steady_ppl.errors import DataError, UsageError
+from steady_ppl.errors import DataError
 from steady_ppl.utils.progress import stages
 from steady_ppl.utils.text import Say, say as say_aside
 
@@ -45,33 +44,18 @@ def read_bags(paths: Sequence[str | Path], mapping: BagMapping, say: Say = say_a
         DataError: naming the bag and, where they apply, the column, the topic and the field.
         UsageError: two bags of one name.
     """
+
+    def read(file: Path) -> Reading:
+        with open_bag(file, mapping.messages) as bag:
+            return _series_of(bag, mapping, say), None
+
+    hint = 'are the clocks the same? clock = "bag" and "aligned" go by that of the recorder'
     files = [Path(path) for path in paths]
-    labels = [bag_name(file) if file.is_dir() else file.stem for file in files]
-    for i, label in enumerate(labels):
-        if label in labels[:i]:
-            raise UsageError(f"two bags are named {label}, and so would be their trajectories: rename one")
-    if not files:
-        raise UsageError("there is no bag: name at least one")
-    kept: dict[str, EvenRows] = {}
-    with stages(*((f"reading {label}", 1) for label in labels)) as begin:
-        for file, label in zip(files, labels, strict=True):
-            begin()
-            with open_bag(file, mapping.messages) as bag:
-                series = _series_of(bag, mapping, say)
-            for name, piece in _pieces(series, mapping, label, say).items():
-                if name in kept:
-                    raise UsageError(f"two trajectories are named {name}: rename the bag {file.name}")
-                kept[name] = piece
-    if not kept:
-        why = f"no trajectory is left of {', '.join(labels)}: no two rows have known controls and a measurement"
-        how = 'are the clocks the same? clock = "bag" and "aligned" go by that of the recorder'
-        raise DataError(f"{why}; {how}")
-    columns = [column.name for column in sorted(mapping.columns, key=lambda column: "uyx".index(column.kind))]
-    blocks = [
-        pd.DataFrame(piece.cells, columns=columns).assign(trajectory=name, time=np.arange(piece.rows) * mapping.step)
-        for name, piece in kept.items()
-    ]
-    return from_frame(pd.concat(blocks, ignore_index=True), name=", ".join(labels))
+    return read_each(files, mapping, read, say, kind="bag", name_of=_label, hint=hint)
+
+
+def _label(file: Path) -> str:
+    return bag_name(file) if file.is_dir() else file.stem
 
 
 def _series_of(bag: Bag, mapping: BagMapping, say: Say) -> list[Series]:
@@ -113,9 +97,7 @@ def _of_topic(bag: Bag, topic: str, columns: list[BagColumn], say: Say) -> list[
     if any(column.clock == "aligned" for column in columns) and len(stamps):
         moved = align(stamps, received)
         times["aligned"] = moved.times
-        off = f"{abs(moved.offset) * 1e3:.3f} ms {'behind' if moved.offset >= 0 else 'ahead of'} the bag's halfway"
-        drift = f"{'lost' if moved.drift >= 0 else 'gained'} {abs(moved.drift) * 1e6:.2f} ppm"
-        say(f"{bag.name}: {topic}: its clock was {off}, the smallest delay included, and {drift}")
+        say(f"{bag.name}: {topic}: {moved.on('bag')}")
     found = []
     for i, column in enumerate(columns):
         missing = sum(cells[i] is None for cells in values)
@@ -124,44 +106,5 @@ def _of_topic(bag: Bag, topic: str, columns: list[BagColumn], say: Say) -> list[
             raise DataError(f"{where}: the index is out of range {among}, the array is shorter")
         if missing:
             say(f"{where}: the array is shorter {among}, where nothing is taken for measured")
-        time = times.get(column.clock, received) - round(column.late * 1e9)
-        found.append(_series(where, column, time, table[:, i]))
+        found.append(series_of(where, column, times.get(column.clock, received), table[:, i]))
     return found
-
-
-def _series(where: str, column: BagColumn, time: np.ndarray, values: np.ndarray) -> Series:
-    """The finite values in the order of their times; a control must have some, and no others."""
-    order = np.argsort(time, kind="stable")
-    time, values = time[order], values[order]
-    good = np.isfinite(values)
-    if column.kind == "u" and not good.all():
-        i = int(good.argmin())
-        got = f"got {values[i]} after {(time[i] - time[0]) / 1e9:.3f} s, expected a finite number"
-        raise DataError(f"{where}: {got}: a control must be known", column=column.name)
-    if column.kind == "u" and not len(time):
-        raise DataError(f"{where}: there is no message, and a control must be known")
-    return Series(column, time[good], values[good])
-
-
-def _pieces(series: list[Series], mapping: BagMapping, label: str, say: Say) -> dict[str, EvenRows]:
-    """The trajectories of a bag by name, without those that say nothing; what is left out is said."""
-    found = in_rows(series, mapping.step, label)
-    for held in long_holds(series, mapping.step):
-        say(f"{label}: {held}")
-    first = min((int(one.times[0]) for one in series if len(one.times)), default=0)
-    kept = {}
-    for i, piece in enumerate(found):
-        name = label if len(found) == 1 else f"{label}-{i + 1}"
-        if piece.rows >= 2:
-            kept[name] = piece
-            continue
-        what = "has one row" if piece.rows else "has no measurement"
-        say(f"{name}, from {(piece.start - first) / 1e9:.3f} s, {what} and is left out")
-    measured = {one.column.name: len(one.times) for one in series if one.column.kind == "y"}
-    rivals = {name: sum(piece.rivals[name] for piece in found) for name in measured}
-    outside = {name: count - sum(piece.placed[name] for piece in found) for name, count in measured.items()}
-    for counts, why in ((rivals, "another was nearer to their row"), (outside, "some control was not known then")):
-        if any(counts.values()):
-            each = ", ".join(f"{count} of {measured[name]} {name}" for name, count in counts.items() if count)
-            say(f"{label}: measurements left out, because {why}: {each}")
-    return kept

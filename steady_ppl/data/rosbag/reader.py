@@ -1,4 +1,4 @@
-"""A bag as topics, messages and their fields, read by `rosbags`; and a listing with a mapping to start from.
+"""A bag as topics, messages and their fields, read by `rosbags`.
 
 ROS 1 bags and most ROS 2 bags define the types of their messages. Where a ROS 2 bag does not (sqlite bags recorded
 before Iron never do), the standard types are those of Humble, and others are read from .msg files. Types are asked
@@ -8,8 +8,6 @@ first, so that a field that does not exist is refused before any message is read
 import difflib
 import math
 import os
-import re
-import textwrap
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -21,12 +19,13 @@ from rosbags.highlevel import AnyReader
 from rosbags.interfaces import Nodetype
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
+from steady_ppl.data.recordings.listing import Entry
 from steady_ppl.data.rosbag.mapping import Steps
 from steady_ppl.errors import DataError, SteadyError, UsageError
 from steady_ppl.utils.files import require_file
-from steady_ppl.utils.text import counted, one_line
+from steady_ppl.utils.text import one_line
 
-FIELD_LIST_COLUMNS = 110  # characters of a list of fields
+ALIGNED_KEY = 'clock = "aligned"  # its header says when it was made; leave out for the time of arrival'
 TEXT_TYPES = ("string", "wstring", "wchar")
 
 
@@ -268,61 +267,30 @@ def _describe(store: Any, kind: Any) -> str:
     return f"an array{length}: name one by its index, such as [0]"
 
 
-def listing(bags: Sequence[Bag]) -> str:
-    """Of each bag its topics with type, number of messages, median rate and numeric fields; then a mapping to start
-    from, whose sections are comments."""
-    sections: dict[tuple[str, str], list[str]] = {}
-    lines = [line for bag in bags for line in _of_bag(bag, sections)]
-    lines += [
-        "",
-        "# A mapping to start from: take the sections that you need out of the comments and name their columns u.NAME",
-        "# (a control), y.NAME (a measurement) or x.NAME (a state that is known).",
-        "step = 0.1  # s between two rows",
-    ]
-    taken: list[str] = []
-    for (topic, field), said in sections.items():
-        name = re.sub(r"\W+", "_", f"{topic}_{field}").strip("_")
-        again = taken.count(name)  # /a/b with c, and /a with b.c
-        taken.append(name)
-        lines += ["#", f'# [columns."y.{name}{f"_{again + 1}" if again else ""}"]', *said]
-    return "\n".join(lines)
-
-
-def _of_bag(bag: Bag, sections: dict[tuple[str, str], list[str]]) -> list[str]:
-    """Its lines; the sections of a mapping, by topic and field, are added to those of other bags."""
+def entries(bag: Bag) -> list[Entry]:
+    """Of each topic its type, times of arrival and numeric fields."""
     arrivals: dict[str, list[int]] = {topic: [] for topic in bag.topics}
     first: dict[str, Any] = {}
     for connection, received, raw in bag.messages(bag.topics):
         arrivals[connection.topic].append(received)
         if connection.topic not in first and not undefined_type(bag.store, connection.msgtype):
             first[connection.topic] = bag.content(connection, raw)
-    lines = [f"# {bag.name}"]
+    found = []
     for topic, at in arrivals.items():
-        types, gaps = bag.types(topic), np.diff(np.sort(np.array(at, dtype=np.int64)))
-        middle = float(np.median(gaps)) if len(gaps) else 0.0
-        rate = f"  {1e9 / middle:.4g} Hz" if middle > 0 else ""
-        lines += ["#", f"# {topic}  {' and '.join(types)}  {counted(len(at), 'message')}{rate}"]
+        types, times = bag.types(topic), np.array(at, dtype=np.int64)
+        about = " and ".join(types)
         if missing := next(filter(None, (undefined_type(bag.store, one) for one in types)), None):
-            lines.append(
-                f'#     {missing} is not defined: name its file, messages = ["PACKAGE/msg/NAME.msg"], in the mapping'
-            )
-        elif len(types) == 1:
+            remark = f'{missing} is not defined: name its file, messages = ["PACKAGE/msg/NAME.msg"], in the mapping'
+            found.append(Entry(topic, about, times, remark=remark))
+        elif len(types) > 1:
+            found.append(Entry(topic, about, times))
+        else:
             fields = list(numeric_fields(bag.store, types[0], first.get(topic)))
-            text = ", ".join(field.replace(" ", "\0") for field in fields) or "no number"
-            wrapped = textwrap.wrap(text, FIELD_LIST_COLUMNS, break_long_words=False, break_on_hyphens=False)
-            lines += [f"#     {line}".replace("\0", " ") for line in wrapped]
-            sections |= _section(topic, fields, has_stamp(bag.store, types[0]))
-    return lines
+            keys = [ALIGNED_KEY] if has_stamp(bag.store, types[0]) else []
+            found.append(Entry(topic, about, times, fields or ["no number"], list(filter(_is_value, fields)), keys))
+    return found
 
 
-def _section(topic: str, fields: list[str], stamped: bool) -> dict[tuple[str, str], list[str]]:
-    """What is said of a topic's first field that is not its time stamp, by topic and field; nothing without one."""
-    said = [field for field in fields if "stamp." not in field and "[]" not in field and not field.startswith("header")]
-    if not said:
-        return {}
-    field, _, reading = said[0].partition(" ")
-    field = field.partition("…")[0].rstrip(".") + ("]" if "…" in field else "")
-    lines = [f'# topic = "{topic}"', f'# field = "{field}"', *(['# as = "yaw"'] if reading else [])]
-    if stamped:
-        lines.append('# clock = "aligned"  # its header says when it was made; leave out for the time of arrival')
-    return {(topic, field): lines}
+def _is_value(field: str) -> bool:
+    """Whether a field holds a number that is not a time stamp's."""
+    return "stamp." not in field and "[]" not in field and not field.startswith("header")

@@ -15,7 +15,8 @@ from small import steady
 from small_tables import same
 
 from steady_ppl import BagColumn, BagMapping, read_bags, read_table
-from steady_ppl.data.rosbag.reader import listing, open_bag
+from steady_ppl.data.recordings.listing import listing
+from steady_ppl.data.rosbag.reader import entries, open_bag
 from steady_ppl.errors import SteadyError
 
 
@@ -153,4 +154,4 @@ def test_damage_is_never_a_traceback(tmp_path: Path, kind: str) -> None:
 
 def _listed(bag: Path) -> str:
     with open_bag(bag) as opened:
-        return listing([opened])
+        return listing([(opened.name, entries(opened))])

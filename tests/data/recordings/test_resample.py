@@ -12,7 +12,7 @@ from bag_writing import Said, stamped, write_bag
 from hypothesis import given, settings, strategies as st
 
 from steady_ppl import BagColumn, BagMapping, DataError, read_bags
-from steady_ppl.data.rosbag.resample import Series, align, in_rows
+from steady_ppl.data.recordings.resample import Series, align, in_rows
 
 MS = 1_000_000
 STEP = 0.1

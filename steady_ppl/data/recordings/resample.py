@@ -1,4 +1,4 @@
-"""From what came at any time to rows at even times; header stamps on the bag's clock.
+"""From what came at any time to rows at even times; a sensor's own stamps on the recorder's clock.
 
 Times are whole nanoseconds throughout, so that a command at the very time of a row is known there.
 """
@@ -9,10 +9,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from steady_ppl.data.rosbag.mapping import BagColumn
+from steady_ppl.data.recordings.mapping import Column
 from steady_ppl.errors import DataError
 
-MAX_BAG_ROWS = 10_000_000  # of a piece of a bag
+MAX_PIECE_ROWS = 10_000_000  # of one trajectory
+Spans = Sequence[tuple[int, int]]  # from when to when, ns
 MAX_PAUSE_RATIO = 20  # times the usual time between commands or the step, the longer, from which a pause is reported
 
 
@@ -20,7 +21,7 @@ MAX_PAUSE_RATIO = 20  # times the usual time between commands or the step, the l
 class Series:
     """What the messages of a topic say in one field."""
 
-    column: BagColumn  # what it becomes
+    column: Column  # what it becomes
     times: np.ndarray  # (messages,) int64 ns, not decreasing
     values: np.ndarray  # (messages,) finite, as they were read: `scale` and `offset` come last
 
@@ -40,10 +41,11 @@ class EvenRows:
         return len(next(iter(self.cells.values())))
 
 
-def in_rows(series: Sequence[Series], step: float, name: str = "bag") -> list[EvenRows]:
+def in_rows(series: Sequence[Series], step: float, name: str = "bag", within: Spans | None = None) -> list[EvenRows]:
     """The pieces between pauses, each with rows from where all controls are known to its last measurement.
 
-    No series of a control may be empty. More rows than `MAX_BAG_ROWS` are a DataError that names the bag.
+    No series of a control may be empty. More rows than `MAX_PIECE_ROWS` are a DataError that names the recording.
+    `within` are the spans beyond which there are no rows; they do not overlap.
     """
     measured = [one.times for one in series if one.column.kind == "y" and len(one.times)]
     if not measured:
@@ -55,8 +57,15 @@ def in_rows(series: Sequence[Series], step: float, name: str = "bag") -> list[Ev
     starts = np.unique(np.concatenate([first for first, _ in known]))
     starts = starts[starts >= max(first[0] for first, _ in known)]
     ends = np.min([end[np.searchsorted(first, starts, side="right") - 1] for first, end in known], 0).clip(max=last)
-    spans = zip(starts.tolist(), ends.tolist(), strict=True)
+    spans = list(zip(starts.tolist(), ends.tolist(), strict=True))
+    if within is not None:
+        spans = [(max(a, c), b if b <= d else _last_row(max(a, c), d, step)) for a, b in spans for c, d in within]
     return [_piece(series, start, end, step, name) for start, end in spans if start <= end]
+
+
+def _last_row(start: int, end: int, step: float) -> int:
+    """The time of the last row that is not after an end."""
+    return start + round((end - start) // (step * 1e9) * step * 1e9)
 
 
 def _stretches(control: Series, last: int) -> tuple[np.ndarray, np.ndarray]:
@@ -89,8 +98,8 @@ def long_holds(series: Sequence[Series], step: float) -> Iterator[str]:
 def _piece(series: Sequence[Series], start: int, end: int, step: float, name: str) -> EvenRows:
     spacing = step * 1e9
     last = int(np.floor((end - start) / spacing + 0.5))
-    if last >= MAX_BAG_ROWS:
-        what = f"{(end - start) / 1e9:.6g} s in steps of {step} s are {last + 1} rows, more than {MAX_BAG_ROWS}"
+    if last >= MAX_PIECE_ROWS:
+        what = f"{(end - start) / 1e9:.6g} s in steps of {step} s are {last + 1} rows, more than {MAX_PIECE_ROWS}"
         raise DataError(f"{name}: {what}; take a larger step, or the same clock for controls and measurements")
     nearest = {one.column.name: _nearest(one, start, spacing, last) for one in series if one.column.kind == "y"}
     rows = 1 + max((int(at[-1]) for at, _, _ in nearest.values() if len(at)), default=-1)
@@ -153,17 +162,24 @@ def _interpolated(one: Series, time: np.ndarray, most: float | None) -> np.ndarr
 
 @dataclass(frozen=True)
 class Alignment:
-    """Header stamps moved onto the bag's clock."""
+    """A sensor's own stamps moved onto the recorder's clock."""
 
     times: np.ndarray  # (messages,) int64 ns, the moved stamps, in the order of the messages
     offset: float  # s that are added to a stamp at the mean of the stamps; the smallest delay is in it
     drift: float  # how much that grows with every second of the stamps' clock; 1e-6 is one ppm
 
+    def on(self, recorder: str) -> str:
+        """What is said of it."""
+        behind = "behind" if self.offset >= 0 else "ahead of"
+        drift = f"{'lost' if self.drift >= 0 else 'gained'} {abs(self.drift) * 1e6:.2f} ppm"
+        off = f"{abs(self.offset) * 1e3:.3f} ms {behind} the {recorder}'s halfway"
+        return f"its clock was {off}, the smallest delay included, and {drift}"
+
 
 def align(stamps: np.ndarray, received: np.ndarray) -> Alignment:
-    """Move header stamps onto the clock on which they were received, `(messages,)` int64 ns each, at least one.
+    """Move a sensor's stamps onto the clock on which they were received, `(messages,)` int64 ns each, at least one.
 
-    A header's clock is off by an offset and drifts, and a message is on its way for a delay that is never negative. Of
+    A sensor's clock is off by an offset and drifts, and a message is on its way for a delay that is never negative. Of
     all lines offset + drift · stamp below the points (stamp, received − stamp), the nearest to them, summed over the
     points, is the edge of their lower convex hull over the mean of the stamps. Stamps moved by that line are when
     messages were made, all late by the smallest delay that occurs. Stamps that are all alike have no drift.
