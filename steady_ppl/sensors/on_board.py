@@ -34,6 +34,9 @@ class Position(Sensor):
     def columns(self, program: Any) -> tuple[str, ...]:
         return f"{self.name}_x [m]", f"{self.name}_y [m]"
 
+    def tells(self, readings: Tensor) -> dict[str, Tensor]:
+        return {"x": readings[..., 0], "y": readings[..., 1]}
+
     def reading(self, program: Any, state: Tensor) -> Tensor:
         if self.offset is None:
             return state[..., :2]
@@ -57,6 +60,10 @@ class Heading(Sensor):
     def columns(self, program: Any) -> tuple[str, ...]:
         return (f"{self.name} [rad]",)
 
+    def tells(self, readings: Tensor) -> dict[str, Tensor]:
+        heading = readings[..., 0]
+        return {"heading": 0.5 * math.pi - heading if self.from_north else heading}
+
     def reading(self, program: Any, state: Tensor) -> Tensor:
         heading = state[..., 2:3]
         return 0.5 * math.pi - heading if self.from_north else heading
@@ -69,6 +76,9 @@ class YawRate(Sensor):
 
     def columns(self, program: Any) -> tuple[str, ...]:
         return (f"{self.name} [rad/s]",)
+
+    def tells(self, readings: Tensor) -> dict[str, Tensor]:
+        return {"yaw_rate": readings[..., 0]}
 
     def reading(self, program: Any, state: Tensor) -> Tensor:
         return state[..., 5:6]
