@@ -46,7 +46,7 @@ class Vehicle:
     def about(self) -> str:
         """What it is, in one line."""
         said = ast.get_docstring(ast.parse(self.file.read_text(encoding="utf-8"))) or self.kind
-        return re.split(r":|, with |\n", said)[0].rstrip(".")
+        return re.split(r"[:;\n]|, with ", said)[0].rstrip(".")
 
     def own(self, kind: type[Sensor], name: str) -> Sensor | None:
         """Its sensor of a class: the one of a name, or the only one."""
