@@ -146,10 +146,8 @@ class _Text:
         fastest: float,
     ) -> str:
         vehicle = self.vehicle
-        carried = ", ".join(one.name for one in sensors)
-        self._put(
-            self.module.body[0], f'"""{vehicle.about}; sensors: {carried}. Begun from models/{vehicle.file.name}."""'
-        )
+        about = f'"""{vehicle.about}; begun from models/{vehicle.file.name}."""'
+        self._put(self.module.body[0], about if len(about) <= CODE_COLUMNS else f'"""{vehicle.about}."""')
         for other in self.others:
             self._put(other, None)
         for statement in self.module.body:

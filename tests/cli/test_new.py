@@ -88,7 +88,7 @@ def test_the_section_of_the_page_is_what_it_says(log: Path, monkeypatch, capsys)
     [
         ("name the vehicle by --vehicle KIND; there are car (speed, steering)", []),
         ("there is no such vehicle; there are car", ["--vehicle", "boot"]),
-        ("no kind of sensor is 'sonar'; there are bearing", ["--vehicle", "car", "--sensor", "sonar:1"]),
+        ("no kind of sensor is 'sonar'; there are ", ["--vehicle", "car", "--sensor", "sonar:1"]),
         ("sd is a number above zero, got -1", ["--vehicle", "car", "--sensor", "position=gps:-1"]),
         ("'foo' is no setting; there are sd, name, offset", ["--vehicle", "car", "--sensor", "position:1,foo=1"]),
         ("its standard deviation is missing", ["--vehicle", "car", "--sensor", "wheel-speed"]),
