@@ -17,7 +17,7 @@ from typing import Annotated, Any
 
 import typer
 
-from steady_ppl.cli import demo, judge, learn, make
+from steady_ppl.cli import demo, judge, learn, make, new
 from steady_ppl.cli.common import as_refusal
 from steady_ppl.cli.progress import progress_line
 from steady_ppl.errors import SteadyError, TableWarning
@@ -50,6 +50,13 @@ def add_command(function: Callable[..., None], about: str, *examples: str, hidde
 
 add_command(demo.demo, "Show the whole loop on drives with a hidden effect.", "steady demo --out demo")
 add_command(make.init, "Make a folder to work in, with first drives.", "steady init lab")
+add_command(
+    new.new,
+    "Write a model from parts: vehicle, controls, sensors.",
+    "steady new robot.py drives.csv --landmark 0,0 --landmark 5,0",
+    "steady new car.py log.csv --control delta=steering --sensor position=gps:0.3 --table-out drives.csv",
+    "steady new boat.py --vehicle car --sensor heading=compass:0.05,from_north=true",
+)
 add_command(
     make.import_bag,
     "Turn ROS 1 or 2 bags and MCAP files into a table.",
@@ -139,6 +146,7 @@ add_command(
     "List the physical effects that a program may lack.",
     "steady effects",
     "steady effects models/hovercraft.py",
+    hidden=True,
 )
 app.add_typer(make.app, name="data", short_help="Published logs to tables; long drives in pieces.")
 

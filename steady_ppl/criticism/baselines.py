@@ -1,7 +1,7 @@
 """What a program has to beat: a vehicle that keeps its velocity, and a measurement that stays as it was."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -9,6 +9,7 @@ import pyro.distributions as dist
 import torch
 from torch import Tensor
 
+from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.gaussian.kalman import Tracked, track
 from steady_ppl.gaussian.predict import Prediction, on_a_circle, predict
 from steady_ppl.model.handlers import Recording, Standardised, as_event, joined, normal_moments, running
@@ -31,13 +32,20 @@ class ConstantVelocity(Program):
     def __init__(self, program: Program, scales: Tensor) -> None:
         super().__init__()
         self.register_buffer("scales", scales)
-        for name in ("states", "controls", "channels", "measurements", "substeps", "angles", "error_groups"):
+        for name in ("states", "controls", "channels", "measurements", "substeps", "angles", "error_groups", "start"):
             setattr(self, name, getattr(program, name))
         self.kept_names = program.kept_names
         object.__setattr__(self, "of", program)  # not a part of this one: Pyro would rename it
 
     def initial(self) -> Tensor:
         return self.of.initial()
+
+    def told(self, data: Trajectories) -> dict[str, tuple[Tensor, Tensor]]:
+        return self.of.told(data)
+
+    @property
+    def derivatives(self) -> Mapping[str, str]:
+        return self.of.derivatives
 
     def transition(self, state: Tensor, control: Tensor, time: Tensor, step: Tensor) -> Tensor:
         with Transforming(self._noise_alone):

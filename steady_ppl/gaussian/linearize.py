@@ -38,6 +38,7 @@ from steady_ppl.model.handlers import (
 )
 from steady_ppl.model.problem import Problem
 from steady_ppl.model.program import Program
+from steady_ppl.model.starts import first_state
 from steady_ppl.model.substeps import mean_step, noisy_step, row_chain, row_inputs
 from steady_ppl.model.validate import noise_size, start_size
 from steady_ppl.utils.angles import wrap
@@ -291,7 +292,7 @@ def _start(problem: Problem, first: Tensor) -> tuple[Tensor, Tensor]:
     def start(noise: Tensor) -> Tensor:
         left = noise.shape[:-1]
         with running(*left), Standardised(noise):
-            return problem.program.initial().expand(*left, -1)
+            return first_state(problem.program, problem.data).expand(*left, -1)
 
     if problem.known_start:
         return problem.data.known_start - first, first.new_zeros((*first.shape, 1))

@@ -12,8 +12,8 @@ from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.errors import DataError
 from steady_ppl.gaussian.linearize import linearize_sensors
 from steady_ppl.gaussian.predict import simulate_again
-from steady_ppl.model.handlers import draw_starts
 from steady_ppl.model.program import Program
+from steady_ppl.model.starts import draw_first_states
 from steady_ppl.model.validate import noise_size
 from steady_ppl.utils.cores import one_thread
 
@@ -42,7 +42,7 @@ def fixes(program: Program, data: Trajectories, *, places: int = 32, passes: int
         DataError: nothing is measured, or fewer than two rows of a drive have enough measurements.
     """
     data = data.without_truth()
-    _, made_up = simulate_again(program, data, draw_starts(program, places, len(data)), noise_size(program))
+    _, made_up = simulate_again(program, data, draw_first_states(program, data, places, len(data)), noise_size(program))
     guesses = made_up.states.unflatten(1, (places, len(data)))  # (T + 1, S, B, D)
     told = (linearize_sensors(program, data, guesses[:, 0]).measurement != 0).flatten(0, 2).any(0)
     enough = (data.observed.sum(-1) >= told.sum()) & data.rows

@@ -24,6 +24,7 @@ from steady_ppl.model.handlers import KnownStart, Recording, Standardised, joine
 from steady_ppl.model.problem import Problem
 from steady_ppl.model.program import Program
 from steady_ppl.model.stability import divergence
+from steady_ppl.model.starts import first_state
 from steady_ppl.model.substeps import all_rows, sample_channels
 from steady_ppl.smc.filter import particle_filter
 from steady_ppl.smc.genealogy import Paths, event_dims
@@ -286,7 +287,7 @@ def smoother_paths(problem: Problem, ahead: Lookahead, draws: int, *, kernels: b
     trajectories = len(data)
     certain = KnownStart(data.known_start) if problem.known_start else Standardised(start_noise.unsqueeze(1))
     with running(draws, 1, trajectories), Recording() as start, certain:
-        program.initial()
+        first_state(program, data)
     few = slice(0, 1)  # one transition says which sites there are
     with running(1, 1, trajectories), Recording() as moving, Standardised(noise[few, few]):
         sample_channels(program, states[few, few], data.controls[few], data.elapsed[few], data.steps[few])

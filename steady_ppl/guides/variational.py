@@ -26,6 +26,7 @@ from steady_ppl.likelihood.scores import channel_moments
 from steady_ppl.model.handlers import KnownStart, Recording, Replaying, Standardised, Substituting, running
 from steady_ppl.model.problem import Problem
 from steady_ppl.model.program import Program
+from steady_ppl.model.starts import first_state
 from steady_ppl.model.substeps import row_inputs, sample_row
 from steady_ppl.model.validate import noise_size, start_size
 from steady_ppl.smc.genealogy import Paths, event_dims
@@ -95,7 +96,7 @@ class VariationalGuide(nn.Module):
         density = weight * (at_start + later)
         if not self.known_start:
             with running(self.draws, 1, len(data)), Recording() as seen, Replaying(paths.start):
-                self.program.initial()
+                first_state(self.program, data)
             logs = [fn.log_prob(paths.start[site]) for site, fn in seen.distributions.items()]
             density = density + torch.stack(logs).sum((0, 2, 3))
         if not self.centred or weight != 1:
@@ -117,7 +118,7 @@ class VariationalGuide(nn.Module):
             at_start, certain = apart.sum(1), Standardised(noise.unsqueeze(1))
         with running(*left):
             with Recording() as started, certain:
-                state = self.program.initial().expand(*left, -1).squeeze(1)
+                state = first_state(self.program, data).expand(*left, -1).squeeze(1)
             states, values = [state], dict[str, list[Tensor]]()
             by_row = zip(*(values.split(1) for values in row_inputs(self.program, data)), strict=True)
             for row, given in enumerate(by_row):

@@ -176,6 +176,26 @@ class PlanarVehicle(Program):
     def _bearings(self) -> tuple[str, ...]:
         return tuple(f"bearing_{i} [rad]" for i in range(len(self.landmarks)))
 
+    def told(self, data: Trajectories) -> dict[str, tuple[Tensor, Tensor]]:
+        """Also what listed sensors tell; a range tells that the vehicle is as near its nearest landmark."""
+        readings = torch.where(data.observed, data.measurements, torch.nan)
+        columns, found = self.sensor_columns, dict[str, tuple[Tensor, Tensor]]()
+        listed = [(one, readings[..., list(columns[one.name])]) for one in self.sensor_parts if one.name in columns]
+        for sensor, its in listed:
+            for name, values in sensor.tells(its).items():
+                found.setdefault(name, (values, torch.zeros_like(values)))
+        found = found | {name: value for name, value in super().told(data).items() if name not in found}
+        ranges = [its for sensor, its in listed if sensor.kind == "range"]
+        ranges += [readings[..., list(at)] for kind, at in self.landmark_columns.items() if kind == "range"]
+        if (
+            "x" not in found and ranges and not isinstance(self.landmarks, Tensor)
+        ):  # a map that is learned tells nothing
+            nearest = ranges[0].nan_to_num(math.inf).min(-1)
+            away = torch.where(nearest.values.isinf(), torch.nan, nearest.values)
+            places = away.new_tensor(self.landmarks)[nearest.indices] + 0 * away.unsqueeze(-1)
+            found |= {"x": (places[..., 0], away), "y": (places[..., 1], away)}
+        return found
+
     def integrate(self, state: Tensor, acceleration: Tensor, step: Tensor) -> Tensor:
         """Return the next state, `(..., 6)`, under an acceleration held in the body frame, to second order in the step.
 

@@ -15,6 +15,7 @@ from torch import Tensor
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.model.handlers import KnownStart, Observing, masked
 from steady_ppl.model.program import Program, for_program
+from steady_ppl.model.starts import first_state
 from steady_ppl.model.substeps import row_inputs, sample_channels
 
 
@@ -69,7 +70,7 @@ class Joint:
                 states = pyro.sample("states", dist.ImproperUniform(constraints.real_vector, (), (dimension,)))
             certain = KnownStart(data.known_start) if self.known_start else nullcontext()
             with pyro.plate("first_row", 1, dim=-2), certain:
-                self.program.initial()
+                first_state(self.program, data)
             with pyro.plate("interval", rows - 1, dim=-2), masked(data.transitions):
                 sample_channels(self.program, states[..., :-1, :, :], *row_inputs(self.program, data))
             with pyro.plate("observed_row", rows, dim=-2), Observing(data.measurements, data.observed):

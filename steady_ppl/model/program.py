@@ -23,6 +23,7 @@ from steady_ppl.utils import context
 if TYPE_CHECKING:
     from steady_ppl.data.trajectories import Trajectories
 
+FIRST_MEASUREMENTS = "first measurements"  # a `start`
 MIN_STEP, MAX_STEP = 1e-10, 1e9  # s between two rows; beyond these the time has another unit
 MAX_NUMBERS_SHOWN = 12  # numbers of a parameter that are shown one by one
 
@@ -122,6 +123,8 @@ class Program(PyroModule):
         resting: state components that start at zero in every drive; a table need not have them.
         kept_names: those of them that are begun anew in every row.
         since_row_before: measurements that the first row of a drive cannot have; cells of the table are passed over.
+        start: "first measurements" centres the prior of `initial` on each trajectory's first measurements, see
+            `steady_ppl.model.starts`; "" leaves it as it is.
         effects: effects that the program has besides what it writes out: `("linear_drag=0.1", "slope=0.05,-0.03")`.
         substeps: in how many steps of `transition` the program takes a row; see `steady_ppl.model.substeps`.
 
@@ -146,6 +149,7 @@ class Program(PyroModule):
     resting: Sequence[str] = ()
     kept_names: Sequence[str] = ()
     since_row_before: Sequence[str] = ()
+    start: str = ""
     effects: Sequence[str] = ()
     substeps: int = 1
 
@@ -234,6 +238,21 @@ class Program(PyroModule):
         """Groups of channels to which one coefficient of a generic effect can belong; each of `motion` alone if not
         overridden."""
         return {channel: (channel,) for channel in self.motion}
+
+    def told(self, data: Trajectories) -> dict[str, tuple[Tensor, Tensor]]:
+        """Return what measurements say of single state components, name → values and by what standard deviation these
+        may be off beside noise, each `(rows, trajectories)`, NaN where missing.
+
+        A measurement tells the component that has its name and unit (`x`, or `gps_x` at the end of a longer name).
+        """
+        found: dict[str, tuple[Tensor, Tensor]] = {}
+        readings = torch.where(data.observed, data.measurements, torch.nan)
+        measured = list(zip(self.measurement_names, self.measurement_units, readings.unbind(-1), strict=True))
+        for name, unit in zip(self.state_names, self.state_units, strict=True):
+            for column, its_unit, values in measured:
+                if unit == its_unit and (column == name or column.endswith(f"_{name}")):
+                    found.setdefault(name, (values, torch.zeros_like(values)))
+        return found
 
     def velocities(self, state: Tensor) -> dict[str, Tensor]:
         """The velocity that each channel accelerates, `(...)`."""

@@ -12,8 +12,9 @@ from torch import Tensor
 
 from steady_ppl.errors import ProgramError, SteadyError
 from steady_ppl.model.handlers import EVENT_HINT, Broadcasting, Observing, Recording, Replaying, draw_starts, running
-from steady_ppl.model.program import Program, names
+from steady_ppl.model.program import FIRST_MEASUREMENTS, Program, names
 from steady_ppl.model.stability import require_convergence
+from steady_ppl.model.starts import require_centred
 from steady_ppl.model.substeps import MAX_SUBSTEPS, is_count
 from steady_ppl.utils.text import one_line
 
@@ -38,6 +39,8 @@ def probe(program: Program) -> None:
         time = step.cumsum(0)
         start, started = _call(name, "initial", program.initial, (DRAWS, 1, TRAJECTORIES))
         _check_state("initial", start, size)
+        if program.start:
+            require_centred(started, size)
         usual = start.abs().flatten(0, -2).amax(0)
         usual = torch.where(usual > 0, usual, 1.0)  # of each component
         state = usual * torch.randn(*LEFT, size).to(parameter)
@@ -94,6 +97,8 @@ def _misdeclared(program: Program) -> Iterator[str]:
     if unknown := set(names(program.since_row_before)) - set(program.measurement_names):
         there = ", ".join(program.measurement_names)
         yield f": since_row_before names {sorted(unknown)[0]!r}, no measurement ({there})"
+    if program.start not in ("", FIRST_MEASUREMENTS):
+        yield f': start is {program.start!r}; expected "{FIRST_MEASUREMENTS}", or nothing'
     if not is_count(program.substeps):
         yield f": substeps is {program.substeps!r}; expected a whole number from 1 to {MAX_SUBSTEPS}"
     if not (isinstance(program.simulated_step, float | int) and program.simulated_step > 0):

@@ -26,6 +26,9 @@ class Position(Sensor):
     def columns(self, program: Any) -> tuple[str, ...]:
         return f"{self.name}_x [m]", f"{self.name}_y [m]"
 
+    def tells(self, readings: Tensor) -> dict[str, Tensor]:
+        return {"x": readings[..., 0], "y": readings[..., 1]}
+
     def reading(self, program: Any, state: Tensor) -> Tensor:
         if self.offset is None:
             return state[..., :2]
@@ -50,6 +53,12 @@ class Heading(Sensor):
 
     def columns(self, program: Any) -> tuple[str, ...]:
         return (f"{self.name} [rad]",)
+
+    def tells(self, readings: Tensor) -> dict[str, Tensor]:
+        if isinstance(self.angle, str):  # it is learned
+            return {}
+        heading = 0.5 * math.pi - readings[..., 0] if self.from_north else readings[..., 0]
+        return {"heading": heading - self.angle}
 
     def reading(self, program: Any, state: Tensor) -> Tensor:
         heading = state[..., 2:3] + setting(program, self.angle, state)
@@ -86,6 +95,9 @@ class YawRate(Sensor):
 
     def columns(self, program: Any) -> tuple[str, ...]:
         return (f"{self.name} [rad/s]",)
+
+    def tells(self, readings: Tensor) -> dict[str, Tensor]:
+        return {"yaw_rate": readings[..., 0]}
 
     def reading(self, program: Any, state: Tensor) -> Tensor:
         return state[..., 5:6]

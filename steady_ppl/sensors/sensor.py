@@ -83,6 +83,10 @@ class Sensor(ABC):
     def reading(self, program: Any, state: Tensor) -> Tensor:
         """What it would read without noise, `(..., K)`."""
 
+    def tells(self, readings: Tensor) -> dict[str, Tensor]:
+        """State components that its readings `(..., K)` give directly, but for noise and offsets: name → `(...)`."""
+        return {}
+
     def distribution(self, program: Any, state: Tensor) -> dist.Independent:
         """Of its readings, `(..., K)`."""
         kind = WrappedNormal if self.of_circle else dist.Normal

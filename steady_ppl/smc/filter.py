@@ -19,6 +19,7 @@ from steady_ppl.errors import FilterError, ProgramError, UsageError
 from steady_ppl.model.handlers import KnownStart, Recording, Standardised, running
 from steady_ppl.model.program import Program
 from steady_ppl.model.stability import divergence
+from steady_ppl.model.starts import first_state
 from steady_ppl.model.substeps import channel_values
 from steady_ppl.smc.compiled import CompiledFilter, OnFrame, compiled_filter
 from steady_ppl.smc.genealogy import Filtered, FilterState, History, Run, event_dims
@@ -81,7 +82,7 @@ class ParticleFilter:
         given = nullcontext() if noise is None else Standardised(noise.to(data.controls.dtype).unsqueeze(1))
         drawing = KnownStart(data.known_start) if self.known_start else given
         with running(*self.left), Recording() as self.start, drawing:
-            states = program.initial()
+            states = first_state(program, data)
         states = states.expand(*self.left, -1).squeeze(1)
         if self.known_start and not bool((states == data.known_start).all()):
             what = "a known start needs initial() to return the sampled state as it is; it returns another"

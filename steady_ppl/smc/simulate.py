@@ -11,9 +11,10 @@ from torch import Tensor
 
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.errors import ProgramError, SteadyError, require
-from steady_ppl.model.handlers import Recording, draw_starts, joined, running
+from steady_ppl.model.handlers import Recording, joined, running
 from steady_ppl.model.program import Program, for_program
 from steady_ppl.model.stability import counts_rows, is_step
+from steady_ppl.model.starts import draw_first_states
 from steady_ppl.model.substeps import MAX_SUBSTEPS, advance, row_inputs, with_substeps
 from steady_ppl.utils.cores import one_thread
 from steady_ppl.utils.progress import stages
@@ -49,6 +50,7 @@ def simulate(
     """
     require(trajectories is None or trajectories > 0, "trajectories", trajectories, "at least 1")
     with seeded(seed, "simulate"):
+        measured = like is not None
         if like is None:
             rows, drives = round(program.duration / program.step) + 1, 1 if trajectories is None else trajectories
             time = (torch.arange(rows, dtype=torch.float64) * program.step)[:, None].repeat(1, drives)
@@ -66,7 +68,7 @@ def simulate(
         run = for_program(program, like)
         program = with_substeps(program, simulated_substeps(program, run) if substeps is None else substeps)
         rows, drives = run.time.shape
-        states = [draw_starts(program, 1, drives)]
+        states = [draw_first_states(program, run if measured else None, 1, drives)]
         inputs = (values.unsqueeze(1) for values in row_inputs(program, run))
         with stages(*[("", 1)] * (rows - 1)) as begin:
             for state in roll_out(program, states[0], *inputs):

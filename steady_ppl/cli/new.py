@@ -1,0 +1,372 @@
+"""`steady new`: a model file from parts, with the names of a table."""
+
+import ast
+import shlex
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, fields
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+import steady_ppl as st
+from steady_ppl.errors import SteadyError, UsageError
+from steady_ppl.utils.text import counted, say, shown, tell
+
+if TYPE_CHECKING:
+    from steady_ppl.runs.table_header import Column, Header, Seen
+    from steady_ppl.runs.vehicle_parts import Vehicle
+    from steady_ppl.sensors import Sensor
+
+SENSOR_FORM = "KIND[=NAME][:SD][,SETTING=VALUE]..."
+
+
+@dataclass
+class Parts:
+    """What a model is made of."""
+
+    vehicle: "Vehicle"
+    controls: list[str]  # their names in the table
+    sensors: "list[Sensor]" = field(default_factory=list)
+    columns: dict[str, str] = field(default_factory=dict)  # of the table → as the model's table has them
+    landmarks: int = 0  # that the table's columns are of
+    guessed: list[str] = field(default_factory=list)  # what is to be checked
+
+
+def new(
+    file: Annotated[Path, typer.Argument(metavar="FILE.py", help="Model to write.")],
+    table: Annotated[Path | None, typer.Argument(help="Drives whose columns say what there is.")] = None,
+    vehicle: Annotated[
+        str | None, typer.Option(metavar="KIND", help="A file of models/ that lists sensors: car, unicycle, …")
+    ] = None,
+    sensor: Annotated[
+        list[str] | None,
+        typer.Option(metavar=SENSOR_FORM, help="As position=gps:0.3; as often as needed. Before what TABLE says."),
+    ] = None,
+    control: Annotated[
+        list[str] | None,
+        typer.Option(metavar="COLUMN=CONTROL", help="What a control of TABLE is: delta=steering; as often as needed."),
+    ] = None,
+    landmark: Annotated[
+        list[str] | None, typer.Option(metavar="X,Y", help="A landmark, m; once for each, in the order of columns.")
+    ] = None,
+    table_out: Annotated[
+        Path | None, typer.Option(metavar="TABLE", help="Write TABLE with the names and units that the model reads.")
+    ] = None,
+    force: Annotated[bool, typer.Option("--force", help="Overwrite existing files.")] = False,
+) -> None:
+    """Write a model from parts: vehicle, controls, sensors.
+
+    With a TABLE, its columns say which, as far as their names do; flags say the rest. At a terminal it asks.
+    """
+    from steady_ppl.runs.table_header import Header
+    from steady_ppl.runs.vehicle_parts import needs_landmarks, sensor_kinds, write_model
+
+    header = None if table is None else Header.read(table)
+    given = dict(_control(text) for text in control or [])
+    parts = _vehicle(file, vehicle, header, given)
+    kinds = sensor_kinds()
+    wanted = [_sensor(text, kinds) for text in sensor or []]
+    if header is not None:
+        _read_sensors(parts, header, kinds, wanted)
+    else:
+        _own_sensors(parts, wanted)
+    if not parts.sensors:
+        answer = _asked("Sensors, with blanks between them (position=gps:0.3 yaw-rate=gyro:0.02)")
+        wanted = [_sensor(text, kinds) for text in shlex.split(answer or "")]
+        if not wanted:
+            raise UsageError(
+                f"no sensor is known by TABLE's columns: name each, --sensor {SENSOR_FORM}; {_kinds(kinds)}"
+            )
+        _own_sensors(parts, wanted)
+    places = [_landmark(text) for text in landmark or []] if needs_landmarks(parts.sensors) else []
+    if needs_landmarks(parts.sensors) and not places:
+        count = str(parts.landmarks or "the")
+        answer = _asked(f"Places of {count} landmarks, m, with blanks between them (0,0 5,0 5,5)")
+        places = [_landmark(text) for text in (answer or "").split()]
+        if not places:
+            raise UsageError(f"the sensors see {count} landmarks: name each by --landmark X,Y, in the order of columns")
+    if parts.landmarks and len(places) != parts.landmarks:
+        raise UsageError(f"{table}: its columns are of {parts.landmarks} landmarks, --landmark names {len(places)}")
+    if landmark and not places:
+        raise UsageError("--landmark: no sensor of this model sees landmarks")
+    renamed = {} if header is None else {old: now for old, now in parts.columns.items() if old != now}
+    if header is not None:
+        renamed |= {name: "" for name in (header.time,) if name != "time"}
+        renamed |= {"trajectory": ""} if header.label != "trajectory" else {}
+        _require_table_out(table, table_out, renamed, force)
+    raw = [raw for raw, called in parts.columns.items() if called.startswith("u.")]
+    units = zip(raw, parts.vehicle.program.control_units, strict=True) if header else ()
+    speeds = [header.largest(name) for name, unit in units if header and unit == "m/s"]
+    given_parts: Any = {"controls": parts.controls, "sensors": parts.sensors, "landmarks": places}
+    program = write_model(file, parts.vehicle, **given_parts, fastest=max(speeds, default=0.0), force=force)
+    place = _table(header, table, table_out, parts, bool(renamed))
+    _report(file, parts, header, place)
+    if place is not None:
+        drives = st.for_program(program, st.read_table(place))
+        for finding in st.doctor(drives, program).findings:
+            say(f"{place.name}: {finding} (`steady doctor {shlex.quote(str(place))}` says how to mend it)")
+    read = shlex.quote(str(place)) if place is not None else "TRAIN.csv"
+    out = shlex.quote(f"runs/{file.stem}")
+    tell(f"\nnext:\n  steady fit {shlex.quote(str(file))} {read} --recipe likelihood --out {out}")
+    tell(f"  steady check {out} {read}")
+
+
+def _vehicle(file: Path, kind: str | None, header: "Header | None", given: Mapping[str, str]) -> Parts:
+    """The vehicle, as named or as a table's controls say."""
+    from steady_ppl.runs.table_header import controls_of
+    from steady_ppl.runs.vehicle_parts import vehicles
+
+    known = vehicles()
+    listed = ", ".join(f"{one} ({', '.join(it.program.control_names)})" for one, it in known.items())
+    if kind is None and header is not None:
+        fitting = {one: found for one, it in known.items() if (found := controls_of(it, header, given)) is not None}
+        if fitting:
+            y_columns = {one.name for one in header.of("y")}
+
+            def rank(one: str) -> tuple[bool, int, int]:
+                program = known[one].program
+                exact = len(y_columns & {*program.measurement_names})
+                return one != file.stem, -exact, sum(value.numel() for value in program.parameters())
+
+            kind, *others = sorted(fitting, key=rank)
+            guessed = [f"the vehicle: {kind}" + (f"; --vehicle {' or '.join(others)} fits as well" if others else "")]
+            return _with_controls(known[kind], fitting[kind], guessed)
+    kind = kind or _asked(f"Vehicle: {listed}")
+    if kind is None:
+        wrong = "" if header is None else f"{header.name}: no vehicle has its controls ({_names(header)}): "
+        how = "name the vehicle by --vehicle KIND" + (", its controls by --control COLUMN=CONTROL" if header else "")
+        raise UsageError(f"{wrong}{how}; there are {listed}")
+    if kind not in known:
+        raise UsageError(f"--vehicle {shown(kind, 40)}: there is no such vehicle; there are {listed}")
+    own = known[kind].program.control_names
+    if strange := {*given.values()} - {*own}:
+        raise UsageError(f"--control: {kind} has no control {', '.join(strange)}; it has {', '.join(own)}")
+    if header is None:
+        names = {control: name for name, control in given.items()}
+        return Parts(known[kind], [names.get(one, one) for one in own])
+    found = controls_of(known[kind], header, given)
+    if found is None:
+        what = f"{header.name}: which columns are {', '.join(own)}?"
+        raise UsageError(f"{what} say it by --control COLUMN=CONTROL; it has {_names(header)}")
+    return _with_controls(known[kind], found, [])
+
+
+def _with_controls(vehicle: "Vehicle", columns: "Sequence[Column]", guessed: list[str]) -> Parts:
+    called = {one.raw: one.called("u") for one in columns}
+    return Parts(vehicle, [name.removeprefix("u.") for name in called.values()], columns=called, guessed=guessed)
+
+
+def _names(header: "Header") -> str:
+    return shown(", ".join(one.raw for one in header.of("u")) or "none", 200)
+
+
+def _read_sensors(
+    parts: Parts, header: "Header", kinds: "Mapping[str, type[Sensor]]", wanted: "Sequence[_Wanted]"
+) -> None:
+    """The sensors that are asked for and those that the columns say, with the columns' names."""
+    from steady_ppl.runs.table_header import sensors_in
+
+    for one in wanted:
+        found = sensors_in(header, [one.kind], parts.columns, one.name)
+        if not found:
+            what = f"{header.name} has no columns of {one.name or one.kind.kind}"
+            raise UsageError(f"--sensor {one.text}: {what}; it has {_y_names(header)}")
+        _take(parts, header, found[0], one)
+    for seen in sensors_in(header, list(kinds.values()), parts.columns):
+        _take(parts, header, seen, None)
+
+
+def _y_names(header: "Header") -> str:
+    return shown(", ".join(one.raw for one in header.of("y")), 200)
+
+
+def _take(parts: Parts, header: "Header", seen: "Seen", wanted: "_Wanted | None") -> None:
+    """Put a sensor that a table has into the model."""
+    from steady_ppl.runs.table_header import required_settings
+    from steady_ppl.runs.vehicle_parts import with_settings
+
+    settings = {"name": seen.name} | (wanted.settings if wanted else {})
+    own = parts.vehicle.own(seen.kind, seen.name)
+    for setting in required_settings(seen.kind):
+        if setting in settings:
+            continue
+        noises = [noise for column in _columns_for(setting, seen) if (noise := header.noise(column)) is not None]
+        value = float(f"{sorted(noises)[len(noises) // 2]:.1g}") if noises else getattr(own, setting, None)
+        if not isinstance(value, float) or not value > 0:
+            raise UsageError(
+                f"the {setting} of {seen.name} cannot be told from {header.name}: --sensor {_kind(seen)}:SD"
+            )
+        settings[setting] = value
+        how = "from differences of neighbouring readings" if noises else "as in the vehicle's file"
+        parts.guessed.append(f"{setting} of {seen.name}: {value:g} ({how})")
+    parts.sensors.append(with_settings(seen.kind, settings, parts.vehicle))
+    parts.columns |= {old: f"y.{name}" for old, name in seen.columns.items()}
+    parts.landmarks = max(parts.landmarks, seen.landmarks)
+
+
+def _kind(seen: "Seen") -> str:
+    return f"{seen.kind.kind.replace(' ', '-')}={seen.name}"
+
+
+def _columns_for(setting: str, seen: "Seen") -> list[str]:
+    """The columns whose noise a setting is: `bearing_sd` that of `…bearing_0`, `sd` that of the others."""
+    of = setting.removesuffix("_sd")
+    named = [old for old, own in seen.columns.items() if of in own.split("_")]
+    if setting != "sd":
+        return named
+    others = {one.name.removesuffix("_sd") for one in fields(seen.kind) if one.name.endswith("_sd")}
+    return [old for old, own in seen.columns.items() if not others & {*own.split("_")}]
+
+
+def _own_sensors(parts: Parts, wanted: "Sequence[_Wanted]") -> None:
+    """The sensors that are asked for; where none are, the vehicle's own."""
+    from steady_ppl.runs.vehicle_parts import with_settings
+
+    if not wanted:
+        parts.sensors = list(parts.vehicle.program.sensors)
+        parts.guessed.append("the sensors: those of the vehicle's own file")
+    for one in wanted:
+        try:
+            made = with_settings(one.kind, one.settings, parts.vehicle)
+        except TypeError:
+            raise UsageError(f"--sensor {one.text}: its standard deviation is missing: {SENSOR_FORM}") from None
+        parts.sensors.append(made)
+        if "sd" not in one.settings:
+            parts.guessed.append(f"sd of {made.name}: {made.sd} (as in the vehicle's file)")
+
+
+@dataclass(frozen=True)
+class _Wanted:
+    """A sensor as it is asked for."""
+
+    text: str
+    kind: "type[Sensor]"
+    settings: dict[str, Any]
+
+    @property
+    def name(self) -> str:
+        return str(self.settings.get("name", ""))
+
+
+def _sensor(text: str, kinds: "Mapping[str, type[Sensor]]") -> _Wanted:
+    """Parse `position=gps:0.3,offset=antenna`."""
+    first, *rest = _split(text)
+    about, _, sd = first.partition(":")
+    kind, _, name = about.partition("=")
+    found = kinds.get(kind.strip().lower().replace("_", "-").replace(" ", "-"))
+    found = found or next((one for one in kinds.values() if one.__name__.lower() == kind.strip().lower()), None)
+    if found is None:
+        raise UsageError(f"--sensor {shown(text, 60)}: no kind of sensor is {shown(kind, 40)!r}; {_kinds(kinds)}")
+    there = [one.name for one in fields(found)]
+    settings: dict[str, Any] = {"name": name.strip()} if name else {}
+    if sd:
+        settings["sd"] = _value(sd)
+    for part in rest:
+        setting, equals, value = part.partition("=")
+        if not equals or setting.strip() not in there:
+            raise UsageError(
+                f"--sensor {shown(text, 60)}: {shown(setting, 40)!r} is no setting; there are {', '.join(there)}"
+            )
+        settings[setting.strip()] = _value(value)
+    try:
+        found(**({"sd": 1.0} | {one: 1.0 for one in there if one.endswith("_sd")} | settings))
+    except SteadyError as error:
+        raise UsageError(f"--sensor {shown(text, 60)}: {error}") from None
+    return _Wanted(text, found, settings)
+
+
+def _split(text: str) -> list[str]:
+    """Parts between commas that stand in no parentheses."""
+    parts, depth = [""], 0
+    for char in text:
+        depth += (char in "([") - (char in ")]")
+        if char == "," and depth == 0:
+            parts.append("")
+        else:
+            parts[-1] += char
+    return parts
+
+
+def _value(text: str) -> Any:
+    """A number, numbers in parentheses, true or false, or else the name of a parameter."""
+    word = text.strip()
+    try:
+        return ast.literal_eval({"true": "True", "false": "False"}.get(word, word))
+    except (ValueError, SyntaxError):
+        return word
+
+
+def _kinds(kinds: "Mapping[str, type[Sensor]]") -> str:
+    return f"there are {', '.join(kinds)}"
+
+
+def _control(text: str) -> tuple[str, str]:
+    column, equals, own = text.partition("=")
+    if not (equals and column.strip() and own.strip()):
+        raise UsageError(f"--control {shown(text, 60)}: expected COLUMN=CONTROL, as delta=steering")
+    return column.strip().removeprefix("u."), own.strip()
+
+
+def _landmark(text: str) -> tuple[float, float]:
+    try:
+        x, y = (float(part) for part in text.split(","))
+        if not (abs(x) < 1e9 and abs(y) < 1e9):
+            raise ValueError
+    except ValueError:
+        raise UsageError(f"--landmark {shown(text, 40)}: expected two numbers, X,Y in m") from None
+    return x, y
+
+
+def _asked(question: str) -> str | None:
+    """An answer at a terminal; None elsewhere, or where there is none."""
+    if not sys.stdin.isatty():
+        return None
+    answer = typer.prompt(question, default="", show_default=False, err=True).strip()
+    return answer or None
+
+
+def _require_table_out(table: Path | None, out: Path | None, renamed: Mapping[str, str], force: bool) -> None:
+    from steady_ppl.data.table import require_table_file
+
+    if out is not None:
+        require_table_file(out)
+        if table is not None and out.exists() and out.samefile(table):
+            raise UsageError(f"--table-out {out} is the table itself: choose another name")
+        if out.exists() and not force:
+            raise UsageError(f"{out} exists: choose another name, or --force to overwrite")
+    elif renamed:
+        what = f"{table}: its columns have other names than a model's ({shown(', '.join(renamed), 100)})"
+        raise UsageError(f"{what}: name a table to write with the right ones, --table-out drives.csv")
+
+
+def _table(
+    header: "Header | None", table: Path | None, out: Path | None, parts: Parts, has_other_names: bool
+) -> Path | None:
+    """The table that the model reads, written where it has to be."""
+    if header is None or (out is None and not has_other_names):
+        return table
+    assert out is not None
+    kept = parts.columns | {one.raw: one.raw for one in header.columns if one.group == "x"}
+    st.write_table(header.as_table(kept), out)
+    return out
+
+
+def _report(file: Path, parts: Parts, header: "Header | None", place: Path | None) -> None:
+    """Say what was written, what is to be checked, and which columns are not used."""
+    told = ", ".join(one.name if one.name == one.kind else f"{one.name} ({one.kind})" for one in parts.sensors)
+    tell(f"{file}: {parts.vehicle.about[:1].lower()}{parts.vehicle.about[1:]}")
+    own = zip(parts.controls, parts.vehicle.program.control_names, strict=True)
+    tell(f"controls: {', '.join(name if name == role else f'{name} ({role})' for name, role in own)}")
+    tell(f"sensors: {told}")
+    if parts.guessed:
+        tell("guessed, to be checked:")
+        tell("\n".join(f"  {one}" for one in parts.guessed))
+    if header is None:
+        return
+    unused = [one.raw for one in header.columns if one.raw not in parts.columns and one.group != "x"]
+    if unused:
+        tell(f"not used: {shown(', '.join(unused), 300)} (`--sensor`, `--control` name what they are)")
+    if place is not None and place.name != header.name:
+        tell(f"{place}: {counted(len(header.frame), 'row')}, written with the model's names and units")
