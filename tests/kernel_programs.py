@@ -17,6 +17,14 @@ EXAMPLES = [
     "neural_vehicle.py:NeuralHovercraft",
     "neural_vehicle.py:NeuralTruck",
     "neural_vehicle.py:AuthorsHovercraft",
+    "car",
+    "differential_drive",
+    "dynamic_bicycle",
+    "thruster_boat",
+    "ship",
+    "motor_joint",
+    "planar_quadrotor",
+    "tumbling_body",
 ]
 
 

@@ -19,7 +19,7 @@ from steady_ppl import Constant, FilterError, SMCGuide, UsageError, bearings_to,
 from steady_ppl.gaussian.smoother import find_and_smooth
 from steady_ppl.gaussian.twisted_proposal import Twist
 from steady_ppl.kernels import jit
-from steady_ppl.model.handlers import Recording, running
+from steady_ppl.model.handlers import Recording, draw_starts, running
 from steady_ppl.model.problem import Problem
 from steady_ppl.smc import compiled, loops
 from steady_ppl.smc.compiled import CompiledFilter, compiled_filter, standard_normal
@@ -30,7 +30,8 @@ from steady_ppl.smc.stepping import Stepping
 
 def both(program, data, particles: int = 40, weight: float | torch.Tensor = 0.7):
     """Its kernels and its own lines, and some states."""
-    states = 2 * torch.randn(particles, len(data), len(program.states))
+    spread = draw_starts(program, 100, 1).std((0, 1))  # a ship turns slower than a hovercraft
+    states = 2 * spread * torch.randn(particles, len(data), len(program.states))
     plain = Stepping(program, data, weight)
     machine = compiled_filter(plain, states, Proposal(), systematic)
     assert isinstance(machine, CompiledFilter), machine
