@@ -45,9 +45,8 @@ class World:
     logged: Callable[[Array], Array] = lambda states: states
 
 
-def drives(world: World, count: int, seed: int) -> st.Trajectories:
-    """Drives with their measurements and no true states."""
-    random = np.random.default_rng(seed)
+def path(world: World, count: int, random: np.random.Generator) -> tuple[Array, Array, Array]:
+    """Times `(rows,)`, controls `(rows, drives, U)` and logged states `(rows, drives, D)` of drives."""
     rows, each = round(world.duration / world.step) + 1, round(world.step / world.fine)
     time = world.step * np.arange(rows)
     if world.commands is not None:
@@ -59,7 +58,7 @@ def drives(world: World, count: int, seed: int) -> st.Trajectories:
     mean, sd = np.array(world.start).T
     state = mean[:, None] + sd[:, None] * random.standard_normal((len(mean), count))
     noise = np.array(world.noise)[:, None] * random.standard_normal((rows, len(world.noise), count))
-    path, h = [state], world.fine
+    states, h = [state], world.fine
     for row in range(rows - 1):
         given = controls[row].T, noise[row], world.truth
         for _ in range(each):
@@ -68,11 +67,23 @@ def drives(world: World, count: int, seed: int) -> st.Trajectories:
             three = world.rates(state + h / 2 * two, *given)
             four = world.rates(state + h * three, *given)
             state = state + h / 6 * (one + 2 * two + 2 * three + four)
-        path.append(state)
-    states = world.logged(np.stack(path)).transpose(0, 2, 1)
+        states.append(state)
+    return time, controls, world.logged(np.stack(states)).transpose(0, 2, 1)
+
+
+def readings(world: World, states: Array) -> Array:
+    """What the sensors read without noise, `(rows, drives, K)`."""
+    return np.stack([reading(states, world.truth) for reading, _ in world.sensors.values()], -1)
+
+
+def drives(world: World, count: int, seed: int) -> st.Trajectories:
+    """Drives with their measurements and no true states."""
+    random = np.random.default_rng(seed)
+    time, controls, states = path(world, count, random)
+    sd = np.array([one for _, one in world.sensors.values()])
+    seen = readings(world, states) + sd * random.standard_normal((*states.shape[:2], len(sd)))
     columns = {f"u.{name}": controls[..., index] for index, name in enumerate(world.controls)}
-    for name, (reading, sigma) in world.sensors.items():
-        columns[f"y.{name}"] = reading(states, world.truth) + sigma * random.standard_normal((rows, count))
+    columns |= {f"y.{name}": seen[..., index] for index, name in enumerate(world.sensors)}
     return st.from_arrays([{"time": time} | {name: part[:, i] for name, part in columns.items()} for i in range(count)])
 
 
