@@ -18,8 +18,7 @@ class TumblingBody(Program):
 
     `inertia` is (a, b): the moments about x and y over that about z; free motion tells no more.
     The quaternion has four components and three degrees of freedom. `transition` and `observe` normalise it, so that
-    its length acts on nothing and receives no noise; only a start may have another length than 1. Directions are unit
-    vectors of the world: the sun, the magnetic field.
+    its length acts on nothing and receives no noise; only a start may have another length than 1.
     Source: Markley and Crassidis, Fundamentals of Spacecraft Attitude Determination and Control, 2014, 3.2–3.3.
     """
 
@@ -32,7 +31,8 @@ class TumblingBody(Program):
     )
     error_groups = {"attitude": states[:4], "rate": ("rate_x", "rate_y", "rate_z")}
     guesses = ("noise",)
-    directions = {"sun": (1.0, 0.0, 0.0), "field": (0.0, 0.6, 0.8)}
+    substeps = 2
+    directions = {"sun": (1.0, 0.0, 0.0), "field": (0.0, 0.6, 0.8)}  # of length 1, world frame
 
     def __init__(self):
         super().__init__()
