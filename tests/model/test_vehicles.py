@@ -192,6 +192,15 @@ def test_a_tumbling_body_keeps_its_energy_its_angular_momentum_and_a_unit_quater
     torch.testing.assert_close(in_world, in_world[:1].expand_as(in_world), rtol=0, atol=1e-3)
 
 
+@pytest.mark.slow
+def test_check_needs_no_controls() -> None:
+    body = example("tumbling_body", torch.float32)
+    body.duration = 2.0
+    seen = st.simulate(body, 4, seed=1).without_truth()
+    check = st.check(st.Fit(body, "hand"), seen, simulations=20)
+    assert check.figures["verdict"].startswith("Nothing found")
+
+
 # --- fits -------------------------------------------------------------------------------------------------------------
 
 
