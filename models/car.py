@@ -15,12 +15,13 @@ class Car(PlanarVehicle):
     """A kinematic bicycle: its rear axle does not slip, its front wheels point where they roll.
 
     a_forward = (speed − v) / settling − w · yaw_rate                     v forward, w lateral velocity
-    a_lateral = −w / settling + v · yaw_rate
+    a_lateral = −(w − rear · yaw_rate) / settling + rear · a_yaw + v · yaw_rate
     a_yaw     = (v tan(steering) / wheelbase − yaw_rate) / settling
 
     A step takes the mean of these exponential responses over itself.
-    The tracked point is the middle of the rear axle; where the antenna is from there, m ahead and to the left, is
-    learned.
+    The rear axle is `rear` m behind the tracked point, 0 by default; a subclass sets it to a number or a `PyroParam`.
+    The antenna's place, m ahead of the tracked point and to its left, is learned. Drives determine only the antenna's
+    distance from the rear axle: learn one of the two. Source: Rajamani, Vehicle Dynamics and Control, 2012, 2.2.
     """
 
     controls = ("speed [m/s]", "steering [rad]")
@@ -33,6 +34,7 @@ class Car(PlanarVehicle):
 
     def __init__(self):
         super().__init__()
+        self.rear = 0.0  # m
         self.wheelbase = PyroParam(tensor(2.8), constraints.positive)  # m
         self.antenna = PyroParam(tensor([1.0, 0.0]), constraints.real)  # m
         self.noise = PyroParam(tensor([2.0, 2.0, 1.0]), constraints.positive)  # m/s², m/s², rad/s²
@@ -45,13 +47,13 @@ class Car(PlanarVehicle):
         speed, steering = control.unbind(-1)
         forward, lateral, yaw_rate = self.body_velocity(state)
         rate = (1 - (-step / self.settling).exp()) / step
-        halfway = forward + 0.5 * step * rate * (speed - forward)  # the speed in the middle of the step
-        turn = halfway * steering.tan() / self.wheelbase
-        mean = stack(
-            (speed - forward) * rate - lateral * yaw_rate,
-            -lateral * rate + halfway * (yaw_rate + 0.5 * step * rate * (turn - yaw_rate)),
-            (turn - yaw_rate) * rate,
-        )
+        faster = (speed - forward) * rate
+        halfway = forward + 0.5 * step * faster  # the speed in the middle of the step
+        yaw = (halfway * steering.tan() / self.wheelbase - yaw_rate) * rate
+        turning = yaw_rate + 0.5 * step * yaw
+        slip = lateral - self.rear * yaw_rate
+        grip = self.rear * yaw - slip * rate
+        mean = stack(faster - (lateral + 0.5 * step * grip) * turning, grip + halfway * turning, yaw)
         acceleration = pyro.sample("acceleration", dist.Normal(mean, self.noise).to_event(1))
         return self.integrate(state, acceleration, step)
 

@@ -59,7 +59,7 @@ from .likelihood.parameter_posterior import (
     ParameterPosterior as ParameterPosterior,
     parameter_posterior as parameter_posterior,
 )
-from .model.actuation import delayed as delayed, lagged as lagged
+from .model.actuation import delayed as delayed, lagged as lagged, rate_limited as rate_limited
 from .model.distributions import WrappedNormal as WrappedNormal
 from .model.interventions import (
     Coloured as Coloured,

@@ -6,6 +6,7 @@ import torch
 from examples import example
 
 from steady_ppl import seeded
+from steady_ppl.model.handlers import draw_starts
 from steady_ppl.smc.compiled import CompiledFilter, compiled_filter, standard_normal
 from steady_ppl.smc.proposal import Proposal
 from steady_ppl.smc.resampling import systematic
@@ -21,6 +22,14 @@ EXAMPLES = [
     "neural_vehicle.py:NeuralHovercraft",
     "neural_vehicle.py:NeuralTruck",
     "neural_vehicle.py:AuthorsHovercraft",
+    "car",
+    "differential_drive",
+    "dynamic_bicycle",
+    "thruster_boat",
+    "ship",
+    "motor_joint",
+    "planar_quadrotor",
+    "tumbling_body",
 ]
 
 
@@ -49,7 +58,8 @@ class Stale(HovercraftTruth):
 
 def both(program, data, particles: int = 40, weight: float | torch.Tensor = 0.7):
     """Its kernels and its own lines, and some states."""
-    states = 2 * torch.randn(particles, len(data), len(program.states))
+    spread = draw_starts(program, 100, 1).std((0, 1))  # a ship turns slower than a hovercraft
+    states = 2 * torch.where(spread > 0, spread, 1.0) * torch.randn(particles, len(data), len(program.states))
     plain = Stepping(program, data, weight)
     machine = compiled_filter(plain, states, Proposal(), systematic)
     assert isinstance(machine, CompiledFilter), machine

@@ -250,7 +250,7 @@ def _correlations(data: Residuals, inside: Array, controls: dict[str, Array]) ->
         values = told / (np.abs(told[inside]).max() or 1.0)
         regressors[name] = np.where(inside, values - values[inside].mean(), 0.0)
         regressors[f"change of {name}"] = np.where(inside, np.diff(values, axis=0, prepend=values[:1]), 0.0)
-    given = np.array([*regressors.values()])
+    given = np.array([*regressors.values()]).reshape(len(regressors), *inside.shape)  # none without controls
     for residual in range(len(data.names)):
         values, there = data.values[..., residual], data.there[..., residual]
         for lag in (lag for lag in LAGS if lag < len(inside) // 2):
@@ -268,6 +268,7 @@ def _correlations(data: Residuals, inside: Array, controls: dict[str, Array]) ->
 
 def _products(regressors: Array, values: Array) -> Array:
     """Sums over rows and drives of each regressor `(N, T, B)` times each set's values `(M, T, B)`, `(N, M)`."""
-    one, other = (np.ascontiguousarray(part, np.float64).reshape(len(part), -1) for part in (regressors, values))
+    cells = values[0].size
+    one, other = (np.ascontiguousarray(part, np.float64).reshape(len(part), cells) for part in (regressors, values))
     with one_thread():
         return (torch.from_numpy(one) @ torch.from_numpy(other).T).numpy()

@@ -1,4 +1,4 @@
-"""What comes of a command on its way: lag and delay of controls that are held from row to row."""
+"""What comes of a command on its way: lag, delay and rate limit of controls that are held from row to row."""
 
 from typing import Any
 
@@ -100,6 +100,29 @@ def _held_ago(control: Array, edges: Array, total: Array, delay: Array) -> Array
             for u in range(count):
                 means[row, b, u] = (integral[row + 1, b, u] - integral[row, b, u]) / (edges[row + 1, b] - edges[row, b])
     return means
+
+
+def rate_limited(control: Tensor, time: Tensor, rate: Tensor) -> Tensor:
+    """Follow commands at a rate's speed at most, averaged over each interval, exact for held controls; the first was
+    held for ever before.
+
+    Args:
+        control: `(rows, trajectories, U)`.
+        time: `(rows, trajectories)` s.
+        rate: the fastest change, in the control's unit a second, one number or `(U,)`; nothing moves if it is not
+            positive.
+    """
+    if len(time) < 2:
+        return control
+    rate = torch.as_tensor(rate, dtype=control.dtype, device=control.device)
+    reach = (rate * row_spans(time).unsqueeze(-1)).clamp(min=torch.finfo(control.dtype).tiny)  # within an interval
+    at, means = control[0], []
+    for command, most in zip(control, reach, strict=True):
+        away = command - at
+        share = (away / most).clamp(-1, 1)
+        means.append(command - share * (away.abs() - 0.5 * share.abs() * most))
+        at = at + share * most
+    return torch.stack(means)
 
 
 def row_spans(time: Tensor) -> Tensor:

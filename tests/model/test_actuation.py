@@ -1,4 +1,4 @@
-"""Lag and delay of controls that are held from row to row, against exact and finely stepped solutions."""
+"""Lag, delay and rate limit of controls that are held from row to row, against exact and finely stepped solutions."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from steady_ppl import delayed, lagged
+from steady_ppl import delayed, lagged, rate_limited
 
 ROWS, DRIVES, CONTROLS = 12, 3, 2
 
@@ -109,3 +109,39 @@ def test_gradients_are_those_of_small_differences(acts, value: float) -> None:
     small = 1e-7  # from the right, as nothing lies left of zero
     slope = (total(at.detach() + small) - total(at.detach())) / small
     torch.testing.assert_close(gradient, slope, rtol=1e-4, atol=1e-4)
+
+
+@pytest.mark.parametrize("rate", [0.5, 5.0, 40.0])
+def test_a_limited_rate_is_the_mean_of_what_moves_so_fast_at_most(rate: float) -> None:
+    control, time = held()
+    fine, got = 2000, rate_limited(control, time, torch.tensor(rate)).numpy()
+    for drive in range(DRIVES):
+        at = control[0, drive].numpy().copy()
+        for row, (begin, end) in enumerate(pairwise(edges_of(time[:, drive].numpy()))):
+            most, total = rate * (end - begin) / fine, np.zeros(CONTROLS)
+            for _ in range(fine):
+                after = at + np.clip(control[row, drive].numpy() - at, -most, most)
+                total, at = total + (at + after) / 2, after
+            np.testing.assert_allclose(got[row, drive], total / fine, atol=2e-3)
+
+
+def test_a_high_rate_limits_nothing_and_each_control_may_have_its_own() -> None:
+    control, time = held()
+    torch.testing.assert_close(rate_limited(control, time, torch.tensor(1e9)), control, rtol=0, atol=1e-6)
+    both = rate_limited(control, time, torch.tensor([0.5, 1e9], dtype=torch.float64))
+    torch.testing.assert_close(both[..., 0], rate_limited(control, time, torch.tensor(0.5))[..., 0])
+    torch.testing.assert_close(both[..., 1], control[..., 1], rtol=0, atol=1e-6)
+    assert torch.equal(rate_limited(control[:1], time[:1], torch.tensor(0.5)), control[:1])
+    still = rate_limited(control, time, torch.tensor(0.0))
+    torch.testing.assert_close(still, control[:1].expand(ROWS, -1, -1), rtol=0, atol=1e-12)
+
+
+def test_the_gradient_of_a_limited_rate_is_that_of_small_differences() -> None:
+    control, time = held()
+    weights = torch.randn_like(control)
+
+    def total(rate: torch.Tensor) -> torch.Tensor:
+        return (weights * rate_limited(control, time, rate)).sum()
+
+    rate = torch.tensor(3.0, dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(total, rate)

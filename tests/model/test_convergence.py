@@ -33,6 +33,13 @@ PROGRAMS = (
     "hovercraft_unknown_map",
     "unicycle",
     "car",
+    "differential_drive",
+    "dynamic_bicycle",
+    "thruster_boat",
+    "ship",
+    "motor_joint",
+    "planar_quadrotor",
+    "tumbling_body",
 )
 # times a program's substeps that an effect of typical size takes: its force is that at a step's beginning
 MORE: dict[str, dict[str, int]] = {

@@ -23,6 +23,14 @@ PROGRAMS = (
     "neural_vehicle:NeuralHovercraft",
     "neural_vehicle:NeuralTruck",
     "pendulum",
+    "car",
+    "differential_drive",
+    "dynamic_bicycle",
+    "thruster_boat",
+    "ship",
+    "motor_joint",
+    "planar_quadrotor",
+    "tumbling_body",
 )
 
 
