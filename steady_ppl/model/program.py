@@ -120,6 +120,7 @@ class Program(PyroModule):
         motion: channel → the state components that are its position and its velocity; the generic effects go by it.
         error_groups: what an error is reported for: name → components whose Euclidean norm it is.
         resting: state components that start at zero in every drive; a table need not have them.
+        roles: control → what it is, `{"delta": "steering"}`; one called as a role of `model.roles` has it by its name.
         effects: effects that the program has besides what it writes out: `("linear_drag=0.1", "slope=0.05,-0.03")`.
         substeps: in how many steps of `transition` the program takes a row; see `steady_ppl.model.substeps`.
 
@@ -142,6 +143,7 @@ class Program(PyroModule):
     motion: Mapping[str, tuple[str, str]] = {}
     error_groups: Mapping[str, Sequence[str]] = {}
     resting: Sequence[str] = ()
+    roles: Mapping[str, str] = {}
     effects: Sequence[str] = ()
     substeps: int = 1
 
