@@ -5,7 +5,7 @@ They are `continuous_worlds.Unicycle` with other commands; the car's sensors are
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import numpy as np
@@ -13,7 +13,17 @@ from continuous_worlds import Array, Unicycle
 
 
 @dataclass(frozen=True)
-class Car(Unicycle):
+class ToldOtherwise(Unicycle):
+    """A unicycle whose drives begin at the speed and the turn rate that its first commands mean."""
+
+    def start(self, random: np.random.Generator, commands: Array) -> Array:
+        first = commands[0].T
+        speed, turn = replace(self, effects=()).told(first, first[0])
+        return super().start(random, np.stack([speed, turn], -1)[None])
+
+
+@dataclass(frozen=True)
+class Car(ToldOtherwise):
     """A kinematic bicycle that is told a speed and a steering angle: ω → v tan(steering) / wheelbase.
 
     The rear axle does not slip; an antenna ahead of it measures where it is.
@@ -52,7 +62,7 @@ class Car(Unicycle):
 
 
 @dataclass(frozen=True)
-class TwoWheels(Unicycle):
+class TwoWheels(ToldOtherwise):
     """A robot on two driven wheels: v → (left + right) / 2, ω → (right − left) / track.
 
     Attributes:
