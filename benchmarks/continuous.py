@@ -174,7 +174,9 @@ def judged(name: str, group: str, index: int, planted: Planted | None = None) ->
     record: Record = {"group": group, "index": index, "seed": seed, "seconds": round(time.perf_counter() - began, 1)}
     if planted is not None:
         options = dict(planted.options)
+        limits = {one["effect"]: one["detection_limit"] for one in found.figures["candidates"]}
         record |= {"planted": {"effect": planted.name, "value": list(planted.value), "options": options}}
+        record |= {"limit": limits.get(planted.name)}  # on these very drives, where its size was given
     return plain(record | said(found))
 
 
