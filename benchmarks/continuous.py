@@ -3,13 +3,16 @@
     python benchmarks/continuous.py alarms  [--sets 25] [--only GROUP ...] [--workers 2]
     python benchmarks/continuous.py limits  [--only GROUP ...] [--workers 2]
     python benchmarks/continuous.py planted [--sets 2] [--only GROUP ...] [--effect NAME[=NUMBER[,NUMBER]] ...]
+                                            [--times 2 3]
     python benchmarks/continuous.py tables
     python benchmarks/continuous.py groups
 
-A job is 16 training and 16 validation drives of a world in `continuous_worlds.py`, and one call of `discover` on the
-program that a user would write. Each job is one line of the results file; a job with a line is not run again.
+A job is 16 training and 16 validation drives of a world in `continuous_worlds.py` or `continuous_wheels.py`, and one
+call of `discover` on the program that a user would write. Each job is one line of the results file; a job with a line
+is not run again.
 `planted` takes its sizes from `results/continuous-limits.json`, which `limits` makes with `discover` on clean drives.
-`--only` takes the beginning of groups' names. `tables` writes `continuous.md` beside the results.
+`--only` takes the beginning of groups' names. `tables` writes `continuous.md` beside the results; with a file of
+planted sets of one's own (`--planted`) a table of these is written beside it.
 """
 
 from __future__ import annotations
@@ -28,7 +31,8 @@ from typing import Any
 
 import numpy as np
 import torch
-from continuous_programs import CartProgram, PendulumProgram, UnicycleProgram
+from continuous_programs import CartProgram, PendulumProgram, TwoWheelProgram, UnicycleProgram
+from continuous_wheels import Car, TwoWheels
 from continuous_worlds import Boat, Cart, Hovercraft, Pendulum, Planted, Unicycle, World, simulate
 from resumable import Record, digest, run, stored
 from scipy import stats
@@ -36,7 +40,7 @@ from scipy import stats
 import steady_ppl
 from steady_ppl import Program, discover, load_program
 from steady_ppl.discovery.result import Discovery
-from steady_ppl.effects import chosen_variant, find
+from steady_ppl.effects import chosen_variant
 
 FOLDER = Path(__file__).parent
 MODELS, RESULTS = FOLDER.parent / "models", FOLDER / "results"
@@ -48,7 +52,9 @@ WIND_DRAG = 0.06  # 1/m: wind acts through a drag that world and program both ha
 ROUGH = (0.2, 0.2, 0.1)
 SOURCES = [
     FOLDER / "continuous_worlds.py",
+    FOLDER / "continuous_wheels.py",
     FOLDER / "continuous_programs.py",
+    MODELS / "car.py",
     MODELS / "hovercraft.py",
     MODELS / "gps_boat.py",
 ]
@@ -82,12 +88,19 @@ def _boat() -> Program:
     return load_program(MODELS / "gps_boat.py:GpsBoat")
 
 
+def _car() -> Program:
+    return load_program(MODELS / "car.py")
+
+
 ON_HOVERCRAFT = (
     *("linear_drag", "quadratic_drag", "coulomb_friction", "yaw_linear_drag", "yaw_quadratic_drag", "yaw_bias"),
     *("side_slip", "magnus", "weathervane", "lateral_coupling", "slope", "wind"),
     *("thrust_asymmetry", "actuator_delay", "actuator_lag", "bearing_bias", "clock_offset"),
 )
 ON_BOAT = ("yaw_linear_drag", "quadratic_drag", "side_slip")
+ON_HULL = ("cross_flow", "added_mass", "caster")
+ON_CAR = ("steering_asymmetry", "backlash", "slope")
+ON_TWO_WHEELS = ("wheel_radius_difference", "track_width", "gain_error:wheels")
 ON_LINE = (
     *("quadratic_drag", "coulomb_friction", "stiffness", "cubic_stiffness", "acceleration_bias"),
     *("actuator_delay", "actuator_lag", "clock_offset"),
@@ -112,6 +125,9 @@ def _groups() -> dict[str, Group]:
     found += [
         Group("unicycle", Unicycle(), UnicycleProgram, effects=ON_WHEELS),
         Group("boat", Boat(), _boat, effects=ON_BOAT),
+        Group("hull", Boat(), _boat, effects=ON_HULL),
+        Group("car", Car(), _car, effects=ON_CAR),
+        Group("two wheels", TwoWheels(), TwoWheelProgram, effects=ON_TWO_WHEELS),
         Group("pendulum", Pendulum(), PendulumProgram, effects=ON_LINE),
         Group("cart", Cart(), CartProgram, effects=ON_LINE),
     ]
@@ -158,7 +174,9 @@ def judged(name: str, group: str, index: int, planted: Planted | None = None) ->
     record: Record = {"group": group, "index": index, "seed": seed, "seconds": round(time.perf_counter() - began, 1)}
     if planted is not None:
         options = dict(planted.options)
+        limits = {one["effect"]: one["detection_limit"] for one in found.figures["candidates"]}
         record |= {"planted": {"effect": planted.name, "value": list(planted.value), "options": options}}
+        record |= {"limit": limits.get(planted.name)}  # on these very drives, where its size was given
     return plain(record | said(found))
 
 
@@ -245,7 +263,7 @@ def limits_of(group: str, effect: str = "") -> Record:
 
 def _limit(program: Program, candidate: Mapping[str, Any]) -> Record:
     """Return one effect's limit, `(k,)`, its options, sign and physical bound."""
-    effect, options = find(candidate["effect"], program), dict(candidate["options"])
+    effect, options = chosen_variant(program, candidate["effect"]).effect, dict(candidate["options"])
     limit = np.atleast_1d(candidate["detection_limit"]).astype(float)
     if candidate["effect"] == "wind":  # its push grows with wind times drag, as long as it is slower than the vehicle
         limit, options = limit * options["drag"] / WIND_DRAG, {"drag": WIND_DRAG}
@@ -287,7 +305,11 @@ def alarm_jobs(groups: Sequence[Group], sets: int) -> dict[str, tuple[Any, ...]]
 
 
 def planted_jobs(
-    groups: Sequence[Group], sets: int, limits: Mapping[str, Mapping[str, Any]], given: Mapping[str, Any]
+    groups: Sequence[Group],
+    sets: int,
+    limits: Mapping[str, Mapping[str, Any]],
+    given: Mapping[str, Any],
+    multiples: Sequence[float] = MULTIPLES,
 ) -> dict[str, tuple[Any, ...]]:
     """Return arguments of `judged` by name for sets with an effect.
 
@@ -296,19 +318,25 @@ def planted_jobs(
         sets: for each effect and size.
         limits: by group and effect.
         given: effects to plant, all when empty; each with its size, or None for multiples of its limit.
+        multiples: of the limit, that are planted.
     """
     jobs: dict[str, tuple[Any, ...]] = {}
     for group in groups:
         for effect in (one for one in group.effects if not given or one in given):
             known = limits.get(group.name, {}).get(effect)
             for index in range(1, sets + 1):
-                for written, planted in _sizes(group, effect, index, known, given.get(effect)):
+                for written, planted in _sizes(group, effect, index, known, given.get(effect), multiples):
                     jobs[written] = (written, group.name, index, planted)
     return jobs
 
 
 def _sizes(
-    group: Group, effect: str, index: int, limit: Mapping[str, Any] | None, value: tuple[float, ...] | None
+    group: Group,
+    effect: str,
+    index: int,
+    limit: Mapping[str, Any] | None,
+    value: tuple[float, ...] | None,
+    multiples: Sequence[float],
 ) -> list[tuple[str, Planted]]:
     """Return the names and effects of one index's jobs."""
     if value is not None:
@@ -317,7 +345,7 @@ def _sizes(
         return [(name, Planted(effect, value, options))]
     if limit is None:
         return []
-    names = {f"{group.name} {effect} x{multiple:g} {index}": multiple for multiple in MULTIPLES}
+    names = {f"{group.name} {effect} x{multiple:g} {index}": multiple for multiple in multiples}
     return [(name, sized(effect, limit, multiple, name)) for name, multiple in names.items()]
 
 
@@ -459,8 +487,10 @@ def _line(record: Record) -> str:
 
 
 def _write_tables(alarms: Path, planted: Path) -> None:
-    text = tables([*stored(alarms).values()], [*stored(planted).values()])
-    alarms.with_name(TABLES).write_text(text, encoding="utf-8")
+    own = planted != PLANTED and alarms == ALARMS  # planted sets that were run apart
+    text = tables([] if own else [*stored(alarms).values()], [*stored(planted).values()])
+    file = planted.with_suffix(".md") if own else alarms.with_name(TABLES)
+    file.write_text(text, encoding="utf-8")
     print(text)
 
 
@@ -471,6 +501,7 @@ def main() -> None:
     parser.add_argument("--sets", type=int, help="a group; of planted ones for each effect and size (25, 2)")
     parser.add_argument("--only", nargs="+", metavar="GROUP", help="beginnings of groups' names")
     parser.add_argument("--effect", nargs="+", metavar="NAME[=NUMBER]", help="plant only these, at these sizes")
+    parser.add_argument("--times", nargs="+", type=float, default=MULTIPLES, help="plant at these multiples of limits")
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--alarms", type=Path, default=ALARMS, help="results file of clean sets")
     parser.add_argument("--planted", type=Path, default=PLANTED, help="results file of sets with an effect")
@@ -485,7 +516,7 @@ def main() -> None:
         run(judged, jobs, options.alarms, version=ENGINE, workers=options.workers, said=_line)
     elif options.work == "planted":
         limits = json.loads(LIMITS.read_text()) if LIMITS.exists() else {}
-        jobs = planted_jobs(groups, options.sets or 2, limits, _given(options.effect))
+        jobs = planted_jobs(groups, options.sets or 2, limits, _given(options.effect), options.times)
         if not jobs:
             raise SystemExit("nothing to plant: run `limits` first, or name an effect with its size (--effect)")
         run(judged, jobs, options.planted, version=ENGINE, workers=options.workers, said=_line)

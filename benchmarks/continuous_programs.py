@@ -1,4 +1,4 @@
-"""The programs that a user would write for the worlds of `continuous_worlds.py`: unicycle, cart and pendulum."""
+"""The programs that a user would write for the continuous worlds: unicycle, robot on two wheels, cart and pendulum."""
 
 from __future__ import annotations
 
@@ -52,6 +52,21 @@ class UnicycleProgram(PlanarVehicle):
     def observe(self, state):
         pyro.sample("position", dist.Normal(state[..., :2], 0.02).to_event(1))
         pyro.sample("heading", WrappedNormal(state[..., 2:3], 0.01).to_event(1))
+
+
+class TwoWheelProgram(UnicycleProgram):
+    """The same, told the speeds of two wheels: speed = (left + right) / 2, turn = (right − left) / track.
+
+    A user calls its controls as the log has them, and says what they are.
+    """
+
+    controls = ("port [m/s]", "starboard [m/s]")
+    roles = {"port": "left_wheel", "starboard": "right_wheel"}
+    track = 0.5  # m
+
+    def transition(self, state, control, time, step):
+        left, right = control.unbind(-1)
+        return super().transition(state, stack(0.5 * (left + right), (right - left) / self.track), time, step)
 
 
 class CartProgram(Program):

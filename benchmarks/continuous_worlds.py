@@ -83,9 +83,21 @@ def acting(commands: Array, step: float, fine: float, effects: Sequence[Planted]
     Args:
         commands: `(rows, drives, U)`, each held for `step`; the first was held for ever before.
         step, fine: s.
-        effects: those on controls act, the others are left out.
+        effects: those on controls act, the others are left out; the second control is the one that steers, or the
+            right one.
     """
     sizes = {one.name: one for one in effects}
+    if "gain_error:wheels" in sizes:
+        commands = commands * (1 + sizes["gain_error:wheels"].size)
+    if "wheel_radius_difference" in sizes:
+        commands = commands * (1 + 0.5 * sizes["wheel_radius_difference"].size * np.array([-1.0, 1.0]))
+    if "track_width" in sizes:
+        mean = commands.mean(-1, keepdims=True)
+        commands = mean + (1 + sizes["track_width"].size) * (commands - mean)
+    if "steering_asymmetry" in sizes:
+        commands = commands + sizes["steering_asymmetry"].size * np.abs(commands) * np.array([0.0, 1.0])
+    if "backlash" in sizes:
+        commands = _loose(commands, sizes["backlash"].size * np.array([0.0, 1.0]))
     if "thrust_asymmetry" in sizes:
         commands = commands * (1 + sizes["thrust_asymmetry"].size * np.array([0.0, 1.0]))
     if "thrust_saturation" in sizes:
@@ -94,6 +106,15 @@ def acting(commands: Array, step: float, fine: float, effects: Sequence[Planted]
         commands = commands - chosen.size * np.sign(commands) * beyond
     fine_commands = _delayed(commands, step, fine, sizes["actuator_delay"].size if "actuator_delay" in sizes else 0.0)
     return _lagged(fine_commands, fine, sizes["actuator_lag"].size) if "actuator_lag" in sizes else fine_commands
+
+
+def _loose(commands: Array, gap: Array) -> Array:
+    """Return where a pin is that commands `(rows, drives, U)` drag along through a gap `(U,)` on either side."""
+    pin, found = commands[0], []
+    for told in commands:
+        pin = np.clip(pin, told - gap, told + gap)
+        found.append(pin)
+    return np.stack(found)
 
 
 def _delayed(commands: Array, step: float, fine: float, delay: float) -> Array:
@@ -169,6 +190,9 @@ PLANAR: dict[str, Force] = {
     "yaw_bias": lambda b, c, o: (0.0, 0.0, c),
     "side_slip": lambda b, c, o: (0.0, -c * (b.lateral - o.get("lead", 0.2) * b.yaw_rate), 0.0),
     "magnus": lambda b, c, o: (0.0, -c * b.forward * b.yaw_rate, 0.0),
+    "added_mass": lambda b, c, o: (c * b.lateral * b.yaw_rate, 0.0, 0.0),
+    "cross_flow": lambda b, c, o: (0.0, -c * b.lateral * np.abs(b.lateral), 0.0),
+    "caster": lambda b, c, o: (0.0, 0.0, -c * b.forward * b.yaw_rate),
     "weathervane": lambda b, c, o: (0.0, 0.0, -c * b.forward * b.lateral),
     "lateral_coupling": lambda b, c, o: (0.0, c * (b.left - b.right), 0.0),
     "slope": _slope,
@@ -373,13 +397,22 @@ class Unicycle(World):
 
     def derivative(self, state: Array, control: Array, noise: Array) -> Array:
         _, _, heading, forward, yaw_rate = state
-        speed, turn = control
-        turn = turn * (1 - self.size("understeer") * forward**2) + self.size("steering_offset") * forward
+        speed, turn = self.told(control, forward)
         yaw = (turn - yaw_rate) / self.turn_time + noise[1]
         yaw = yaw + self.size("yaw_bias") - self.size("caster") * forward * yaw_rate
         lateral, cos, sin = self._lateral(forward, yaw_rate), np.cos(heading), np.sin(heading)
-        faster = (speed - forward) / self.speed_time + noise[0]
+        faster = (speed - forward) / self.speed_time + noise[0] + self._downhill(cos, sin)
         return np.stack([cos * forward - sin * lateral, sin * forward + cos * lateral, yaw_rate, faster, yaw])
+
+    def told(self, control: Array, forward: Array) -> tuple[Array, Array]:
+        """Return the speed and the turn rate that its commands mean, m/s and rad/s, each `(drives,)`."""
+        speed, turn = control
+        return speed, turn * (1 - self.size("understeer") * forward**2) + self.size("steering_offset") * forward
+
+    def _downhill(self, cos: Array, sin: Array) -> Array:
+        """Return what a planted slope adds ahead, m/s²."""
+        x, y = next((one.value for one in self.effects if one.name == "slope"), (0.0, 0.0))
+        return cos * x + sin * y
 
     def logged(self, states: Array) -> Array:
         x, y, heading, forward, yaw_rate = states.transpose(1, 0, 2)

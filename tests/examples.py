@@ -21,7 +21,9 @@ MODELS = Path(__file__).parent.parent / "models"
 
 
 def example(name: str, dtype: torch.dtype = torch.float64) -> Program:
-    """A program of `models/`, for example "hovercraft" or "hovercraft.py:HovercraftTruth"."""
+    """A program of `models/`, for example "hovercraft" or "hovercraft.py:HovercraftTruth", or `TwoWheels`."""
+    if name == "two_wheels":
+        return TwoWheels().to(dtype)
     file, _, program = name.partition(":")
     source = MODELS / f"{file.removesuffix('.py')}.py"
     return load_program(f"{source}:{program}" if program else source).to(dtype)
@@ -91,6 +93,21 @@ def elsewhere(program: Program, data: Trajectories, turn: float) -> tuple[Progra
     states = data.states
     parts = [place(states[..., :2]), states[..., 2:3] + turn, states[..., 3:5] @ rotation.T, states[..., 5:]]
     return Elsewhere().double(), replace(data, states=torch.cat(parts, -1)), place
+
+
+class TwoWheels(type(load_program(MODELS / "unicycle.py"))):
+    """The unicycle, told the speeds of its wheels: speed (left + right) / 2, turn (right − left) / .5 m."""
+
+    controls = ("port [m/s]", "starboard [m/s]")
+    roles = {"port": "left_wheel", "starboard": "right_wheel"}
+
+    def transition(self, state, control, time, step):
+        left, right = control.unbind(-1)
+        return super().transition(state, stack(0.5 * (left + right), 2 * (right - left)), time, step)
+
+    def example_controls(self, time):
+        speed, turn = super().example_controls(time).unbind(-1)
+        return stack(speed - 0.25 * turn, speed + 0.25 * turn)
 
 
 class HeavyTailed(type(load_program(MODELS / "hovercraft.py"))):

@@ -31,6 +31,7 @@ from torch import Tensor
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.errors import UsageError
 from steady_ppl.model.program import Program
+from steady_ppl.model.roles import ROLES, controls_of
 
 VERDICT_OF_FORM = {
     "push": "dynamics",
@@ -50,6 +51,15 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 def needs(*conditions: Need) -> Callable[[Program], str | None]:
     """Return what an effect `lacks`: the reason of the first condition that does not hold for a program."""
     return lambda program: next((reason for holds, reason in conditions if not holds(program)), None)
+
+
+def has_role(*roles: str) -> Need:
+    """Return the need of a control that has one of some roles."""
+    texts = [ROLES[role].text + f" ({ROLES[role].unit})" * bool(ROLES[role].unit) for role in roles]
+    example = f'roles = {{"NAME": "{roles[-1]}"}}'
+    listed = " or ".join(filter(None, [", ".join(texts[:-1]), texts[-1]]))
+    reason = f"no control is {listed}: declare one in `roles`, as {example}"
+    return lambda program: controls_of(program, *roles), reason
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,4 +1,4 @@
-"""What comes of a command on its way: lag, delay and rate limit of controls that are held from row to row."""
+"""What comes of a command on its way: lag, delay, rate limit and play of controls that are held from row to row."""
 
 from typing import Any
 
@@ -123,6 +123,34 @@ def rate_limited(control: Tensor, time: Tensor, rate: Tensor) -> Tensor:
         means.append(command - share * (away.abs() - 0.5 * share.abs() * most))
         at = at + share * most
     return torch.stack(means)
+
+
+def with_play(control: Tensor, gap: Tensor) -> Tensor:
+    """What follows a control through a gap: it stays within `gap` of it, and moves no further than that takes.
+
+    Args:
+        control: `(rows, trajectories, U)`; the first is in the middle of the gap.
+        gap: half the play, in the control's unit; none if it is not positive.
+    """
+    gap = torch.as_tensor(gap, dtype=control.dtype, device=control.device).clamp(min=0.0)
+    low, high = control - gap, control + gap
+    if _is_plain(low, high):
+        return torch.from_numpy(_dragged(*(part.detach().contiguous().numpy() for part in (control, low, high))))
+    at, found = control[0], [control[0]]
+    for row in range(1, len(control)):
+        at = torch.maximum(low[row], torch.minimum(high[row], at))
+        found.append(at)
+    return torch.stack(found)
+
+
+@njit(cache=True, error_model="numpy")
+def _dragged(control: Array, low: Array, high: Array) -> Array:
+    """The loop of `with_play`, compiled."""
+    found = np.empty_like(control)
+    found[0] = control[0]
+    for row in range(1, len(control)):
+        found[row] = np.maximum(low[row], np.minimum(high[row], found[row - 1]))
+    return found
 
 
 def row_spans(time: Tensor) -> Tensor:

@@ -125,6 +125,7 @@ class Program(PyroModule):
         since_row_before: measurements that the first row of a drive cannot have; cells of the table are passed over.
         start: "first measurements" centres the prior of `initial` on each trajectory's first measurements, see
             `steady_ppl.model.starts`; "" leaves it as it is.
+        roles: control → what it is, `{"delta": "steering"}`; one called as a role of `model.roles` has it by its name.
         effects: effects that the program has besides what it writes out: `("linear_drag=0.1", "slope=0.05,-0.03")`.
         substeps: in how many steps of `transition` the program takes a row; see `steady_ppl.model.substeps`.
 
@@ -150,6 +151,7 @@ class Program(PyroModule):
     kept_names: Sequence[str] = ()
     since_row_before: Sequence[str] = ()
     start: str = ""
+    roles: Mapping[str, str] = {}
     effects: Sequence[str] = ()
     substeps: int = 1
 

@@ -120,10 +120,11 @@ def is_step(program: Program, data: Trajectories) -> bool:
 
 @torch.no_grad()
 def counts_rows(program: Program) -> bool:
-    """Return whether `actuators` of one of its classes looks at other rows but not at the time between them.
+    """Return whether `actuators` of one of its classes goes by how many rows there are, not by the time between them.
 
-    A delay that is a number of rows (`control.roll(1, 0)`) is another delay in substeps. Each class that defines
-    `actuators` is looked at, so that a lag on top of such a delay does not hide it.
+    A delay that is a number of rows (`control.roll(1, 0)`) is another delay in substeps; play, which goes by the
+    commands alone, is the same. Each class that defines `actuators` is looked at, so that a lag on top of such a delay
+    does not hide it.
     """
     kinds = [kind for kind in type(program).__mro__ if kind is not Program]
     if not (methods := [vars(kind)["actuators"] for kind in kinds if "actuators" in vars(kind)]):
@@ -132,13 +133,13 @@ def counts_rows(program: Program) -> bool:
     with seeded("commands"):
         commands = torch.randn(PROBED_COMMAND_ROWS, 1, len(program.controls)).to(like)
     times = program.step * torch.arange(PROBED_COMMAND_ROWS).to(like).unsqueeze(-1)
-    other = torch.cat([commands[:1] + 1.0, commands[1:]])
+    twice = 0.5 * program.step * torch.arange(2 * PROBED_COMMAND_ROWS).to(like).unsqueeze(-1)
 
     def counts(act: Callable[[Program, Tensor, Tensor], Tensor]) -> bool:
         acting = act(program, commands, times)
         if not torch.equal(acting, act(program, commands, ROW_SPACING_FACTOR * times)):
             return False
-        return not torch.equal(acting[1:], act(program, other, times)[1:])
+        return not torch.equal(acting.repeat_interleave(2, 0), act(program, commands.repeat_interleave(2, 0), twice))
 
     return any(counts(method) for method in methods)
 

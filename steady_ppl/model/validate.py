@@ -13,6 +13,7 @@ from torch import Tensor
 from steady_ppl.errors import ProgramError, SteadyError
 from steady_ppl.model.handlers import EVENT_HINT, Broadcasting, Observing, Recording, Replaying, draw_starts, running
 from steady_ppl.model.program import FIRST_MEASUREMENTS, Program, names
+from steady_ppl.model.roles import wrong_roles
 from steady_ppl.model.stability import require_convergence
 from steady_ppl.model.starts import require_centred
 from steady_ppl.model.substeps import MAX_SUBSTEPS, is_count
@@ -99,6 +100,7 @@ def _misdeclared(program: Program) -> Iterator[str]:
         yield f": since_row_before names {sorted(unknown)[0]!r}, no measurement ({there})"
     if program.start not in ("", FIRST_MEASUREMENTS):
         yield f': start is {program.start!r}; expected "{FIRST_MEASUREMENTS}", or nothing'
+    yield from wrong_roles(program)
     if not is_count(program.substeps):
         yield f": substeps is {program.substeps!r}; expected a whole number from 1 to {MAX_SUBSTEPS}"
     if not (isinstance(program.simulated_step, float | int) and program.simulated_step > 0):

@@ -55,7 +55,7 @@ class Heading(Sensor):
         return (f"{self.name} [rad]",)
 
     def tells(self, readings: Tensor) -> dict[str, Tensor]:
-        if isinstance(self.angle, str):  # it is learned
+        if not isinstance(self.angle, float | int):  # it is learned
             return {}
         heading = 0.5 * math.pi - readings[..., 0] if self.from_north else readings[..., 0]
         return {"heading": heading - self.angle}

@@ -6,18 +6,29 @@ from dataclasses import replace
 from pathlib import Path
 
 import continuous
+import continuous_wheels
 import continuous_worlds
 import numpy as np
 import pytest
 import torch
 from continuous import GROUPS, exact_interval, planted_jobs, sized, user_program
+from continuous_wheels import Car, TwoWheels
 from continuous_worlds import PLANAR, Boat, Cart, Hovercraft, Pendulum, Planted, Unicycle, acting, integrate, simulate
 from scipy.integrate import solve_ivp
 
 from steady_ppl import for_program
 from steady_ppl.effects import chosen_variant
 
-WORLDS = (Hovercraft(), Hovercraft(driven="smooth", thrust=3.0), Boat(duration=4.0), Unicycle(), Cart(), Pendulum())
+WORLDS = (
+    Hovercraft(),
+    Hovercraft(driven="smooth", thrust=3.0),
+    Boat(duration=4.0),
+    Unicycle(),
+    Car(),
+    TwoWheels(),
+    Cart(),
+    Pendulum(),
+)
 
 
 def solved(rate, start, commands, step):
@@ -61,6 +72,35 @@ def test_the_hovercraft_agrees_with_an_adaptive_solver(driven):
     for drive in range(3):
         expected = solved(rate, drives.states[0, drive].numpy(), drives.controls[:, drive].numpy(), 0.1)
         assert np.abs(drives.states[:, drive].numpy() - expected).max() < 1e-5
+
+
+def test_a_car_on_a_slope_agrees_with_an_adaptive_solver():
+    def rate(time, state, speed, steering):
+        _, _, heading, forward, yaw_rate = state
+        told = forward * math.tan(steering + 0.1 * abs(steering)) / 2.8
+        faster = (speed - forward) / 0.1 + 0.4 * math.cos(heading) - 0.3 * math.sin(heading)
+        return [forward * math.cos(heading), forward * math.sin(heading), yaw_rate, faster, (told - yaw_rate) / 0.1]
+
+    effects = (Planted("slope", (0.4, -0.3)), Planted("steering_asymmetry", (0.1,)))
+    drives = simulate(replace(still(Car()), effects=effects), 2, seed=1)
+    for drive in range(2):
+        x, y, heading, vx, vy, yaw_rate = drives.states[0, drive].numpy()
+        start = [x, y, heading, vx * math.cos(heading) + vy * math.sin(heading), yaw_rate]
+        expected = solved(rate, start, drives.controls[:, drive].numpy(), 0.1)
+        assert np.abs(drives.states[:, drive, :3].numpy() - expected[:, :3]).max() < 1e-4
+
+
+def test_commands_of_wheels_and_steering_act_as_planted():
+    wheels = np.array([[[1.0, 1.4]], [[-0.5, 0.5]]])
+    for name, expected in (
+        ("wheel_radius_difference", wheels * [0.9, 1.1]),
+        ("track_width", [[[0.96, 1.44]], [[-0.6, 0.6]]]),
+        ("gain_error:wheels", 1.2 * wheels),
+    ):
+        assert np.allclose(acting(wheels, 0.1, 0.1, (Planted(name, (0.2,)),)), expected), name
+    steering = np.stack([np.ones(4), [0.2, 0.25, 0.5, 0.3]], -1)[:, None]
+    dragged = acting(steering, 0.1, 0.1, (Planted("backlash", (0.1,)),))
+    assert np.allclose(dragged[:, 0], np.stack([np.ones(4), [0.2, 0.2, 0.4, 0.4]], -1))
 
 
 def test_drag_and_slip_of_the_boat_agree_with_an_adaptive_solver():
@@ -169,9 +209,11 @@ def test_a_world_refuses_an_effect_that_it_has_not():
 
 
 def test_the_worlds_take_nothing_but_the_table_from_the_engine():
-    tree = ast.parse(Path(continuous_worlds.__file__).read_text())
-    taken = [node for node in ast.walk(tree) if isinstance(node, ast.ImportFrom) and "steady" in (node.module or "")]
-    assert [alias.name for node in taken for alias in node.names] == ["Trajectories"]
+    for module, allowed in ((continuous_worlds, ["Trajectories"]), (continuous_wheels, [])):
+        tree = ast.parse(Path(module.__file__).read_text())
+        imports = [node for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)]
+        taken = [node for node in imports if "steady" in (node.module or "")]
+        assert [alias.name for node in taken for alias in node.names] == allowed
 
 
 @pytest.mark.parametrize("name", PLANAR)

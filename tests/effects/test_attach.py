@@ -31,6 +31,9 @@ from steady_ppl.model.validate import probe
         ("hovercraft", ("lever_arm", "coloured_noise:translation", "heavy_tails")),
         ("truck", ("curvature_steering", "command_noise", "range_dependent_noise")),
         ("pendulum", ("coulomb_friction", "cubic_stiffness", "coloured_noise")),
+        ("car", ("backlash", "steering_asymmetry", "slope")),
+        ("two_wheels", ("wheel_radius_difference", "track_width", "gain_error:wheels")),
+        ("gps_boat", ("added_mass", "cross_flow", "caster")),
     ],
 )
 def test_step_after_step_is_the_same_as_all_steps_at_once(name: str, effects: tuple[str, ...]) -> None:

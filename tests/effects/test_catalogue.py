@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from functools import cache
 
+import numpy as np
 import pyro
 import pytest
 import torch
@@ -20,7 +21,12 @@ from steady_ppl.model.handlers import Recording
 from steady_ppl.model.validate import probe
 
 PROGRAMS = ("hovercraft", "truck", "pendulum")
+BY_ROLE = {  # of other programs what these cannot have
+    "car": ("backlash", "steering_asymmetry", "steering_offset", "slope"),
+    "two_wheels": ("wheel_radius_difference", "track_width", "gain_error"),
+}
 EFFECTS = [(program, effect.name) for program in PROGRAMS for effect in catalogue(example(program))]
+EFFECTS += [(program, effect) for program, names in BY_ROLE.items() for effect in names]
 every_effect = pytest.mark.parametrize(("name", "effect"), EFFECTS, ids=["-".join(pair) for pair in EFFECTS])
 slow_on_one_program = pytest.mark.parametrize(("name", "effect"), each_effect_once_slow(EFFECTS))
 
@@ -120,6 +126,9 @@ def limited(value: float, most: float) -> float:
         ("lateral_coupling", 0.2, (0, 0.2 * 0.5, 0)),
         ("weathervane", 0.2, (0, 0, -0.2 * FORWARD * LATERAL)),
         ("magnus", 0.2, (0, -0.2 * FORWARD * 0.3, 0)),
+        ("added_mass", 0.2, (0.2 * LATERAL * 0.3, 0, 0)),
+        ("cross_flow", 0.2, (0, 0.2 * LATERAL**2, 0)),  # it slides to the right
+        ("caster", 0.2, (0, 0, -0.2 * FORWARD * 0.3)),
         ("lever_arm", 0.2, (0.2 * 0.3**2, 0.2 * 0.5 / 1.5, 0)),  # a_yaw = −0.5 / 1.5
         ("side_slip:lead=0.5", 0.2, (0, -0.2 * (LATERAL - 0.5 * 0.3), 0)),
         (
@@ -198,12 +207,66 @@ def test_a_wind_carries_what_is_at_rest_and_stops_when_it_moves_along() -> None:
         ("crab_angle", 0.2, (0, 0.2 * 0.95 / 0.1, 0)),  # likewise
         ("slip_angle", 0.2, (0, -0.2 * (FORWARD * 0.5 * 0.4 + (0.95 - FORWARD) * 0.3) / 0.1, 0)),
         ("caster", 0.2, (0, 0, -0.2 * FORWARD * 0.3)),
+        ("slope", (0.2, 0.1), (0.2 * COS + 0.1 * SIN, 0, 0)),  # its wheels hold it sideways
+        ("steering_asymmetry", 0.2, (0, 0, 0.2 * 0.5 * 0.4 / 0.1)),
     ],
 )
 def test_a_truck_is_pushed_as_the_equation_says(effect: str, value: float, pushes: tuple[float, ...]) -> None:
     program, control = example("truck"), torch.tensor([0.95, 0.4], dtype=torch.float64)
     got = means(program.with_effect(effect, value), control=control) - means(program, control=control)
     torch.testing.assert_close(got, torch.tensor(pushes, dtype=torch.float64), rtol=1e-6, atol=1e-6)
+
+
+def acting(effect: str, value: float, commands: list[list[float]], name: str, roles=None) -> list[list[float]]:
+    """What a program with an effect makes of commands, a row each."""
+    program = example(name)
+    if roles:
+        program.controls, program.roles = ("engine [N]", "helm [rad]"), roles
+    given = torch.tensor(commands, dtype=torch.float64).unsqueeze(1)
+    clock = 0.1 * torch.arange(len(commands), dtype=torch.float64).unsqueeze(1)
+    program = program.with_effect(effect, value)
+    with torch.no_grad():
+        plain = program.actuators(given, clock)
+    learned = program.actuators(given, clock).detach()  # by gradients it is the same
+    torch.testing.assert_close(learned, plain, rtol=1e-12, atol=1e-12)
+    return plain.squeeze(1).tolist()
+
+
+@pytest.mark.parametrize(("name", "roles"), [("car", None), ("car", {"helm": "rudder"})])
+def test_what_steers_is_loose_or_bends_to_one_side(name: str, roles) -> None:
+    steering = np.array([0.2, 0.25, 0.4, 0.35, 0.1, 0.0, 0.05, -0.3, 0.3])
+    commands = [[3.0, one] for one in steering.tolist()]
+    pin, dragged = steering[0], []
+    for told in steering:  # a pin that is dragged along in a gap of .1 on either side
+        if abs(told - pin) > 0.1:
+            pin = told - math.copysign(0.1, told - pin)
+        dragged.append(pin)
+    assert np.allclose(acting("backlash", 0.1, commands, name, roles), np.stack([np.full(9, 3.0), dragged], -1))
+    assert acting("backlash", 0.0, commands, name, roles) == commands
+    bent = np.stack([np.full(9, 3.0), steering + 0.2 * np.abs(steering)], -1)
+    assert np.allclose(acting("steering_asymmetry", 0.2, commands, name, roles), bent)
+
+
+def test_two_wheels_are_unlike_too_large_or_too_far_apart() -> None:
+    wheels = np.array([[1.0, 1.4], [-0.5, 0.5]])
+    speed, turn = wheels.mean(-1), (wheels[:, 1] - wheels[:, 0]) / 0.5
+    for effect, expected in (
+        ("wheel_radius_difference", wheels * [0.9, 1.1]),
+        ("track_width", np.stack([speed - 0.25 * 1.2 * turn, speed + 0.25 * 1.2 * turn], -1)),
+        ("gain_error:wheels", 1.2 * wheels),
+        ("gain_error:starboard", wheels * [1.0, 1.2]),
+    ):
+        assert np.allclose(acting(effect, 0.2, wheels.tolist(), "two_wheels"), expected, rtol=1e-6), effect
+
+
+def test_a_rudder_and_front_wheels_hang_askew_each_alone() -> None:
+    program = example("car")
+    program.controls = ("speed [m/s]", "steering [rad]", "rudder [rad]")
+    variants = chosen_variant(program, "steering_offset").effect.variants(program)
+    assert [(one.at, one.unit) for one in variants] == [("steering", "rad"), ("rudder", "rad")]
+    control = torch.ones(3, dtype=torch.float64)
+    moved = variants[1](program, STATE, control, STEP, c=torch.tensor(0.2, dtype=torch.float64))
+    assert moved.tolist() == pytest.approx([1.0, 1.0, 1.2])
 
 
 def test_a_spring_pulls_a_pendulum_back() -> None:

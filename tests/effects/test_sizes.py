@@ -12,7 +12,9 @@ from steady_ppl.effects import Sizes, catalogue
 from steady_ppl.effects.sizes import time_of_change
 
 
-@pytest.mark.parametrize("name", ["hovercraft", "gps_boat", "truck", "pendulum", "linear_gaussian"])
+@pytest.mark.parametrize(
+    "name", ["hovercraft", "gps_boat", "truck", "car", "two_wheels", "pendulum", "linear_gaussian"]
+)
 def test_every_effect_has_a_size_on_every_vehicle(name):
     program = example(name, torch.float32)
     data = drives(program, 6, 61)

@@ -18,6 +18,7 @@ from steady_ppl import (
     with_substeps,
 )
 from steady_ppl.criticism.step_size import check_step
+from steady_ppl.model.actuation import with_play
 from steady_ppl.model.stability import counts_rows, is_step
 from steady_ppl.model.substeps import (
     acting_controls,
@@ -122,7 +123,14 @@ class Halved(type(example("hovercraft"))):
         return 0.5 * control
 
 
-@pytest.mark.parametrize(("kind", "expected"), [(RowsLate, True), (Delayed, False), (Halved, False)])
+class Loose(type(example("hovercraft"))):
+    """Its commands are dragged through a gap, which goes by them alone."""
+
+    def actuators(self, control, time):
+        return with_play(control, torch.tensor(0.1))
+
+
+@pytest.mark.parametrize(("kind", "expected"), [(RowsLate, True), (Delayed, False), (Halved, False), (Loose, False)])
 def test_actuators_that_count_rows_are_told_from_others(kind, expected) -> None:
     program = kind().double()
     assert counts_rows(program) is expected

@@ -1,6 +1,7 @@
 """What lies between the command and the force: gains, knees, delays, wear."""
 
 import math
+from collections.abc import Callable
 from functools import partial
 from typing import Any
 
@@ -9,21 +10,39 @@ from torch import Tensor
 
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.effects.catalogue.forces import PLANAR, THRUSTS
-from steady_ppl.effects.declaration import Choices, Effect, Names, Need, declare, needs
-from steady_ppl.model.actuation import delayed, lagged, row_spans
+from steady_ppl.effects.declaration import Choices, Effect, Names, Need, declare, has_role, needs
+from steady_ppl.model.actuation import delayed, lagged, row_spans, with_play
 from steady_ppl.model.program import Program
+from steady_ppl.model.roles import controls_of
 
 CONTROLS: Need = (lambda program: program.controls, "the program has no controls")
 SUBSTEPS: Need = (lambda program: program.substeps > 1, "it takes a row in one step (fit with --substeps)")
-THRUSTERS: Need = (THRUSTS[0], "there are no controls left and right")
+STEERS = has_role("turn", "rudder", "steering")
+LINKAGE = has_role("rudder", "steering")
 NO_TWO_THRUSTS: Need = (
-    lambda program: {"left", "right"} != set(program.control_names),
+    lambda program: len(program.controls) != 2 or len(controls_of(program, "left", "right")) != 2,
     "of two thrusts it is the asymmetry, up to mass and inertia",
 )
 
 
 def _each(program: Program, data: Trajectories | None = None) -> Choices:
     return [{"controls": (name,), "at": name} for name in program.control_names]
+
+
+def _each_and_wheels(program: Program, data: Trajectories | None) -> Choices:
+    """Each alone, and two wheels together, whose common radius may be wrong."""
+    wheels = controls_of(program, "left_wheel", "right_wheel")
+    return [*_each(program), *([{"controls": wheels, "at": "wheels"}] if len(wheels) == 2 else [])]
+
+
+def _each_of(*roles: str) -> Callable[[Program, Trajectories | None], Choices]:
+    """Each control that has one of some roles, at its name unless there is one only."""
+
+    def choices(program: Program, data: Trajectories | None) -> Choices:
+        found = controls_of(program, *roles)
+        return [{"controls": (name,), **({"at": name} if len(found) > 1 else {})} for name in found]
+
+    return choices
 
 
 def _everywhere(program: Program, data: Trajectories | None = None) -> Choices:
@@ -59,7 +78,7 @@ _on_controls = partial(_on_commands, lacks=needs(CONTROLS))
 _on_time = partial(_on_controls, limit=2.0, sign=1, between=(0.0, math.inf), choices=_everywhere)
 
 
-@_on_commands("1", typical=0.05, limit=0.5, lacks=needs(THRUSTERS))
+@_on_commands("1", typical=0.05, limit=0.5, lacks=needs(*THRUSTS))
 def thrust_asymmetry(self: Program, control: Tensor, time: Tensor, c: Tensor) -> Tensor:
     r"""right → (1 + c) right
 
@@ -67,18 +86,29 @@ def thrust_asymmetry(self: Program, control: Tensor, time: Tensor, c: Tensor) ->
     feels: pulls to one side, the more the harder it is driven
     occurs: a chipped propeller, a tyre with less air, one motor of another batch
     """
-    return control * (1 + c * self.chosen_controls(("right",), control))
+    return control * (1 + c * self.chosen_controls(controls_of(self, "right"), control))
 
 
-@_on_commands("1", typical=0.08, limit=1.0, choices=_each, lacks=needs(NO_TWO_THRUSTS, CONTROLS))
+@_on_commands("1", typical=0.08, limit=1.0, choices=_each_and_wheels, lacks=needs(NO_TWO_THRUSTS, CONTROLS))
 def gain_error(self: Program, control: Tensor, time: Tensor, c: Tensor, controls: Names) -> Tensor:
-    r"""u → (1 + c) u of one control
+    r"""u → (1 + c) u of one control, or of two wheels
 
     equation: u \to (1 + c)\,u
     feels: does more (or less) than it is told
     occurs: a motor constant taken from the data sheet, a gear ratio or a wheel radius that is off
     """
     return control * (1 + c * self.chosen_controls(controls, control))
+
+
+@_on_commands("1", typical=0.08, limit=1.0, choices=_each_of("turn", "steering", "rudder"), lacks=needs(STEERS))
+def steering_asymmetry(self: Program, control: Tensor, time: Tensor, c: Tensor, controls: Names) -> Tensor:
+    r"""u → u + c |u| of what steers
+
+    equation: u \to u + c\,|u|
+    feels: turns tighter to one side than to the other
+    occurs: a servo whose horn is not square to its rod, linkages (Ackermann steering), a propeller beside the rudder
+    """
+    return control + c * self.chosen_controls(controls, control) * control.abs()
 
 
 @declare(ACTUATORS, "command", "s/m", typical=0.1, limit=1.0, lacks=needs(PLANAR))
@@ -116,6 +146,26 @@ def dead_zone(self: Program, control: Tensor, time: Tensor, c: Tensor, controls:
     """
     lost = torch.minimum(torch.maximum(control, -c), c)
     return control - self.chosen_controls(controls, control) * lost
+
+
+@_on_commands(
+    "of the control",
+    typical=0.1,
+    limit=1.0,
+    sign=1,
+    between=(0.0, math.inf),
+    probes=(0.03, 0.1, 0.25),
+    choices=_each_of("steering", "rudder"),
+    lacks=needs(LINKAGE),
+)
+def backlash(self: Program, control: Tensor, time: Tensor, c: Tensor, controls: Names) -> Tensor:
+    r"""u_acting stays while |u - u_acting| < c, and else follows at that distance; a drive begins in the middle
+
+    equation: u_\mathrm{acting} \to \max(u - c, \min(u + c, u_\mathrm{acting}))
+    feels: does nothing at first when it is steered the other way
+    occurs: worn steering gears and tie rods, geared servos, rudder chains
+    """
+    return control + self.chosen_controls(controls, control) * (with_play(control, c) - control)
 
 
 @_on_time("s", typical=0.25, probes=(0.1, 0.3, 0.6))

@@ -11,11 +11,12 @@ import torch
 from torch import Tensor
 
 from steady_ppl.data.trajectories import Trajectories
-from steady_ppl.effects.declaration import Choices, Effect, Means, Names, Need, Pushes, declare, needs
+from steady_ppl.effects.declaration import Choices, Effect, Means, Names, Need, Pushes, declare, has_role, needs
 from steady_ppl.effects.sizes import sizes_of_channels, speed_of
 from steady_ppl.model.handlers import draw_starts
 from steady_ppl.model.planar_vehicle import PlanarVehicle
 from steady_ppl.model.program import Program
+from steady_ppl.model.roles import controls_of
 from steady_ppl.utils.random import seeded
 
 KNEE_SPEED = 0.05  # m/s; a friction's knee where nothing is known of speeds
@@ -32,10 +33,7 @@ ONE_COMPONENT: Need = (lambda program: not BODY[0](program), "it has two compone
 YAW: Need = (lambda program: "yaw" in program.axes, "there is no yaw channel")
 PLANAR: Need = (lambda program: isinstance(program, PlanarVehicle), "it acts on vehicles in the plane only")
 SLIP: Need = (lambda program: program.slips, "the program holds the lateral velocity at zero")
-THRUSTS: Need = (
-    lambda program: {"left", "right"} <= set(program.control_names),
-    "the controls are not a left and a right thrust",
-)
+THRUSTS = (has_role("left"), has_role("right"))
 
 
 def _each(groups: Mapping[str, Names]) -> Choices:
@@ -157,7 +155,7 @@ def coulomb_friction(self: Program, state: Tensor, *_: Tensor, c: Tensor, channe
 
     equation: a = -c\,v / \sqrt{v^2 + v_0^2}
     feels: brakes the same at any speed, then stops dead
-    occurs: sledges, tracked robots, wheels with the brake dragging, linear guides and ball screws
+    occurs: rolling resistance of tyres (Wong 2008), sledges, tracked robots, a dragging brake, guides and ball screws
     """
     velocity = self.velocities(state)
     return {channel: -c * velocity[channel] * (velocity[channel] ** 2 + knee**2).rsqrt() for channel in channels}
@@ -250,9 +248,9 @@ def cubic_stiffness(self: Program, state: Tensor, *_: Tensor, c: Tensor, channel
     return {channel: -c * position[channel] ** 3 for channel in channels}
 
 
-@_where_it_slips("m/s²", typical=(0.05, -0.03), limit=0.5, components=("x", "y"))
+@_on_any("m/s²", typical=(0.05, -0.03), limit=0.5, components=("x", "y"))
 def slope(self: Program, state: Tensor, *_: Tensor, c: Tensor) -> Pushes:
-    r"""world-frame acceleration (c₁, c₂)
+    r"""world-frame acceleration (c₁, c₂), of vehicles that do not slip its forward component
 
     equation: \dot v_\mathrm{world} = (c_1, c_2)
     feels: drifts the same way over ground, wherever it points
@@ -260,7 +258,7 @@ def slope(self: Program, state: Tensor, *_: Tensor, c: Tensor) -> Pushes:
     """
     x, y = c.unbind(-1)
     cos, sin = state[..., 2].cos(), state[..., 2].sin()
-    return {"forward": cos * x + sin * y, "lateral": cos * y - sin * x}
+    return {"forward": cos * x + sin * y, **({"lateral": cos * y - sin * x} if self.slips else {})}
 
 
 @_where_it_slips(
@@ -290,7 +288,7 @@ def wind(self: Program, state: Tensor, *_: Tensor, c: Tensor, drag: Any) -> Push
     }
 
 
-@_force("1/kg", typical=0.2, limit=1.0, lacks=needs(THRUSTS, PLANAR))
+@_force("1/kg", typical=0.2, limit=1.0, lacks=needs(PLANAR, *THRUSTS))
 def lateral_coupling(self: Program, state: Tensor, control: Tensor, *_: Tensor, c: Tensor) -> Pushes:
     r"""a_lateral = c (left - right)
 
@@ -298,7 +296,7 @@ def lateral_coupling(self: Program, state: Tensor, control: Tensor, *_: Tensor, 
     feels: steps sideways when it is told to turn
     occurs: propellers whose wash hits a skeg, a stern that swings, the paddle-wheel effect of a single screw
     """
-    left, right = control[..., self.control_index("left")], control[..., self.control_index("right")]
+    left, right = (control[..., self.control_index(name)] for name in controls_of(self, "left", "right"))
     return {"lateral": c * (left - right)}
 
 
@@ -320,10 +318,36 @@ def magnus(self: Program, state: Tensor, *_: Tensor, c: Tensor) -> Pushes:
 
     equation: a_\mathrm{lateral} = -c\,v_x\,\omega
     feels: curves carry it to the inside (or outside)
-    occurs: spinning hulls and balls; the centripetal term of a program that forgot that its frame turns
+    occurs: spinning hulls and balls; the added mass of hulls (the u r term of Fossen 2011, chapter 6); the centripetal
+        term of a program that forgot that its frame turns
     """
     forward, _, yaw_rate = self.body_velocity(state)
     return {"lateral": -c * forward * yaw_rate}
+
+
+@_where_it_slips("1", typical=0.3, limit=2.0)
+def added_mass(self: Program, state: Tensor, *_: Tensor, c: Tensor) -> Pushes:
+    r"""a_forward = c v_y ω
+
+    equation: a_\mathrm{forward} = c\,v_y\,\omega
+    feels: loses speed in turns in which it slides outwards, and more than drag explains
+    occurs: hulls and airships, which carry more water or air along sideways than ahead (the v r term of Fossen 2011,
+        chapter 6)
+    """
+    _, lateral, yaw_rate = self.body_velocity(state)
+    return {"forward": c * lateral * yaw_rate}
+
+
+@_where_it_slips("1/m", typical=0.2, limit=2.0, sign=1)
+def cross_flow(self: Program, state: Tensor, *_: Tensor, c: Tensor) -> Pushes:
+    r"""a_lateral = -c v_y |v_y|
+
+    equation: a_\mathrm{lateral} = -c\,v_y\,|v_y|
+    feels: fast sideways motion dies out, slow sideways motion and forward motion do not
+    occurs: hulls and pontoons that are swept sideways through water (cross-flow drag, Fossen 2011, chapter 6)
+    """
+    _, lateral, _ = self.body_velocity(state)
+    return {"lateral": -c * lateral * lateral.abs()}
 
 
 @_where_it_slips("m", typical=0.15, limit=1.0)

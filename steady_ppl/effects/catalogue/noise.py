@@ -22,6 +22,7 @@ from steady_ppl.effects.catalogue.wheels import SPEED_AND_TURN
 from steady_ppl.effects.declaration import Choices, Effect, Names, Need, Pushes, declare, needs
 from steady_ppl.model.planar_vehicle import PlanarVehicle
 from steady_ppl.model.program import Program
+from steady_ppl.model.roles import controls_of
 
 CHANNELS: Need = (lambda program: program.channels, "the program has no noise channels")
 MOTION: Need = (
@@ -131,7 +132,7 @@ def process_noise(self: Program, *_: Tensor, c: Tensor, channels: Names) -> Push
     return dict.fromkeys(channels, c)
 
 
-@_noise("spread", "s/m", typical=1.0, limit=5.0, sign=1, lacks=needs(SPEED_AND_TURN, PLANAR))
+@_noise("spread", "s/m", typical=1.0, limit=5.0, sign=1, lacks=needs(PLANAR, *SPEED_AND_TURN))
 def command_noise(self: Program, state: Tensor, control: Tensor, *_: Tensor, c: Tensor) -> Pushes:
     r"""σ → σ (1 + c |command - state|)
 
@@ -140,7 +141,7 @@ def command_noise(self: Program, state: Tensor, control: Tensor, *_: Tensor, c: 
     occurs: speed controllers that slip and jerk while they accelerate
     """
     forward, _, yaw_rate = self.body_velocity(state)
-    speed, turn = control[..., self.control_index("speed")], control[..., self.control_index("turn")]
+    speed, turn = (control[..., self.control_index(name)] for name in controls_of(self, "speed", "turn"))
     slow, askew = (speed - forward).abs(), (turn - yaw_rate).abs()
     return {"forward": (1 + c * slow).clamp(min=0.05), "yaw": (1 + c * askew).clamp(min=0.05)}
 
