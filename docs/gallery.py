@@ -23,9 +23,11 @@ from steady_ppl.model.program import for_program, names, unit_of, units
 DOCS = Path(__file__).parent
 ROOT = DOCS.parent
 RECORDS = ROOT / "benchmarks" / "results" / "discovery-continuous.jsonl"
-PROGRAMS = ("hovercraft", "truck", "pendulum", "car", "differential_drive")  # the first that can have an effect shows it
+# the first that can have an effect shows it
+PROGRAMS = ("hovercraft", "truck", "pendulum", "car", "differential_drive")
 QUIET = 0.1  # of the channels' noise, so that the effect is seen; but for effects on that noise
-SEEDS = {"hovercraft": 4, "truck": 3, "pendulum": 4, "car": 1, "differential_drive": 1}  # of drives on which much happens
+# of drives on which much happens
+SEEDS = {"hovercraft": 4, "truck": 3, "pendulum": 4, "car": 1, "differential_drive": 1}
 WITH, WITHOUT = "#d55e00", "#0072b2"  # Okabe and Ito
 HEAD = """# Effect gallery
 

@@ -1,5 +1,6 @@
 """The score of every effect of the catalogue at a program that has none of them."""
 
+import copy
 import itertools
 import math
 from collections.abc import Iterator, Sequence
@@ -11,7 +12,7 @@ from torch import Tensor
 
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.discovery.curves import CURVE, by_height, multiplier, over_reading, over_state, variables
-from steady_ppl.effects import Variant
+from steady_ppl.effects import Variant, attach
 from steady_ppl.errors import FilterError
 from steady_ppl.gaussian.information_filter import Lookahead
 from steady_ppl.gaussian.lanes import LANES
@@ -19,7 +20,9 @@ from steady_ppl.gaussian.predict import simulate_again
 from steady_ppl.gaussian.smoother import smooth
 from steady_ppl.likelihood.parameters import Element
 from steady_ppl.likelihood.scores import (
+    Arrivals,
     Smoothed,
+    arrivals,
     channel_moments,
     component_major,
     measured,
@@ -30,7 +33,7 @@ from steady_ppl.likelihood.scores import (
 from steady_ppl.model.interventions import by_channel
 from steady_ppl.model.problem import Problem
 from steady_ppl.model.program import Program
-from steady_ppl.model.substeps import acting_controls, row_controls
+from steady_ppl.model.substeps import acting_controls, noisy_step, row_controls, row_inputs
 from steady_ppl.utils.cores import Output, run_in_parallel
 from steady_ppl.utils.random import seeded
 from steady_ppl.utils.text import reason_of
@@ -172,6 +175,17 @@ class Scoring:
     def _history(self, variant: Variant, c: tuple[Tensor, Tensor], width: float) -> Tensor:
         up, down = (variant(self.program, self.controls, self.data.elapsed, c=value)[:-1] for value in c)
         return ((up - down) * self.of_control).sum((0, -1)) / width
+
+    def _between(self, variant: Variant, c: tuple[Tensor, Tensor], width: float) -> Tensor:
+        """By where rows end: the course of controls within a row is in no mean of a row."""
+        states, noise = self._arriving.states, self._arriving.noise
+        changed = (attach(copy.deepcopy(self.program), variant, value) for value in c)
+        up, down = (noisy_step(self.program, states, noise, *row_inputs(one, self.data)).double() for one in changed)
+        return self._arriving.score(up - down) / width
+
+    @cached_property
+    def _arriving(self) -> Arrivals:
+        return arrivals(self.at.ahead, self.data)
 
     @cached_property
     def of_control(self) -> Tensor:

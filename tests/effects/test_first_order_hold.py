@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pyro
 import pyro.distributions as dist
@@ -12,9 +14,13 @@ from pyro.nn import PyroParam
 from torch import tensor
 
 from steady_ppl import Program, UsageError, for_program, from_arrays, seeded, stack, with_substeps
-from steady_ppl.effects import catalogue, with_effect
+from steady_ppl.discovery.effect_scores import Scoring, columns_of
+from steady_ppl.effects import catalogue, chosen_variant, with_effect
+from steady_ppl.gaussian.smoother import find_path, smooth
 from steady_ppl.likelihood.maximize import fit_by_likelihood
 from steady_ppl.likelihood.parameter_posterior import ridged_inverse
+from steady_ppl.likelihood.scores import smoothed
+from steady_ppl.model.problem import Problem
 from steady_ppl.model.substeps import acting, mean_step, row_inputs
 from steady_ppl.runs.export import Dynamics
 
@@ -99,6 +105,23 @@ def test_a_force_that_grows_steadily_moves_the_cart_as_its_integral_says() -> No
     exact = ((end**3 - begin**3) / 6 - begin**2 / 2 * (end - begin)) / 1.5
     held, ramped = (abs(one - exact) for one in ends)
     assert ramped < 0.01 * held
+
+
+def test_its_score_is_the_slope_of_the_evidence() -> None:
+    program = with_substeps(Cart().double(), 8)
+    program.mass, program.noise = (torch.tensor(value, dtype=torch.float64) for value in (1.8, 0.3))
+    problem = Problem(program, for_program(program, drives()))
+
+    def evidence(share: float) -> torch.Tensor:
+        changed = replace(problem, program=with_effect(program, "first_order_hold", share))
+        return smooth(changed, find_path(changed)).log_likelihood
+
+    scoring = Scoring(program, problem.data, smoothed(smooth(problem, find_path(problem)), problem.data))
+    (column,) = columns_of([chosen_variant(program, "first_order_hold")])
+    with torch.no_grad():
+        torch.testing.assert_close(
+            scoring(column)[:, 0], (evidence(0.01) - evidence(-0.01)) / 0.02, rtol=1e-3, atol=1e-4
+        )
 
 
 @pytest.mark.slow
