@@ -19,6 +19,7 @@ from matplotlib.figure import Figure
 from steady_ppl import Program, Trajectories, load_program, simulate
 from steady_ppl.effects import Effect, catalogue
 from steady_ppl.model.program import for_program, names, unit_of, units
+from steady_ppl.sensors import BodyVelocity
 
 DOCS = Path(__file__).parent
 ROOT = DOCS.parent
@@ -121,9 +122,8 @@ def program_of(effect: Effect) -> tuple[str, Program]:
     for name in PROGRAMS:
         program = load_program(ROOT / "models" / f"{name}.py")
         if name == "car":  # nobody knows of its antenna
-            program.sensors = tuple(
-                replace(one, offset=None) if one.kind == "position" else one for one in program.sensors
-            )
+            known = (replace(one, offset=None) if one.kind == "position" else one for one in program.sensors)
+            program.sensors = (*known, BodyVelocity(sd=0.05, name="doppler"))
         if effect.lacks(program) is None:
             with torch.no_grad():
                 program.noise = program.noise * (1.0 if effect.form in ("spread", "colour") else QUIET)

@@ -148,7 +148,7 @@ add_command(
     "steady effects models/hovercraft.py",
     hidden=True,
 )
-app.add_typer(make.app, name="data", short_help="Published logs to tables; long drives in pieces.")
+app.add_typer(make.app, name="data", hidden=True, short_help="Published logs to tables; long drives in pieces.")
 
 
 def say_version(asked: bool) -> None:

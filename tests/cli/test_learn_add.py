@@ -98,5 +98,5 @@ def test_effects_lists_the_catalogue_and_what_a_program_cannot_lack(capsys) -> N
     assert capsys.readouterr().out == (MODELS.parent / "docs" / "effects.md").read_text()
     assert steady("effects", MODELS / "truck.py") == 0
     out = capsys.readouterr().out
-    assert "| `curvature_steering` |" in out and "| `slope` |" not in out
-    assert "- `slope`: the program holds the lateral velocity at zero" in out
+    assert "| `curvature_steering` |" in out and "| `wind` |" not in out
+    assert "- `wind`: the program holds the lateral velocity at zero" in out
