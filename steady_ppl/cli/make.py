@@ -94,7 +94,8 @@ def import_log(
 
     files = [path for path in arguments if path.suffix == ".toml" or str(path) in READY]
     logs = [path for path in arguments if path not in files]
-    if not logs and [*map(str, files)] == [str(arguments[0])] and str(files[0]) in READY and out is None:
+    alone = [*map(str, arguments)] == [*map(str, files[:1])] and str(arguments[0]) in READY
+    if alone and not any((out, column, step, begin, end)):
         tell((READY_FOLDER / f"{files[0]}.toml").read_text(encoding="utf-8"), end="")
         return
     if not logs or len(files) > 1:

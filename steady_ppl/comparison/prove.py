@@ -34,6 +34,7 @@ from steady_ppl.gaussian.predict import suited_horizons
 from steady_ppl.likelihood.outliers import Outliers, find_outliers
 from steady_ppl.model.problem import Problem
 from steady_ppl.model.program import Program, for_program
+from steady_ppl.model.starts import centre_of_start
 from steady_ppl.runs.diagnostics import diagnose_units
 from steady_ppl.runs.fit import Fit
 from steady_ppl.utils.cores import one_thread
@@ -131,6 +132,7 @@ def prove(
         found[NOISE_FLOOR] = as_row(floor, _counted([floor]), held_measurements(floor))
     drives = before.problem.data
     notes += drives.uneven_steps + diagnose_units(before.problem.program, drives)
+    notes += _different_starts(judged)
     notes += _few_rows(drives, ahead, known_start) + unconverged(rows) + _blown_up(found) + doubtful(found, data)
     return Proof(found, reference, ahead, drives.median_step, len(data), known_start, seed, outliers, notes)
 
@@ -183,6 +185,22 @@ def _require(programs: Mapping[str, Program], reference: str, truth: str | None,
     if data.time.shape[0] < 2 or not bool(data.observed[1:].any()):
         raise DataError("nothing to compare: no trajectory has a measurement after its first row")
     refuse_long(data)
+
+
+def _different_starts(judged: Mapping[str, Judged]) -> list[str]:
+    """Say where the first measurements tell the programs different priors of the start."""
+    problems = {name: one.problem for name, one in judged.items()}
+    centres = {
+        name: torch.cat(centre_of_start(one.program, one.data)).nan_to_num(torch.inf) if one.program.start else None
+        for name, one in problems.items()
+        if not one.known_start
+    }
+    (first, own), *others = list(centres.items()) or [("", None)]
+    return [
+        f"{name} and {first} have different priors of the start: a part of their log p(y) is that"
+        for name, centre in others
+        if not (own is centre is None or (own is not None and centre is not None and torch.equal(own, centre)))
+    ]
 
 
 def _few_rows(data: Trajectories, horizons: Mapping[str, int], known_start: bool) -> list[str]:

@@ -123,7 +123,7 @@ class Proof(Displayed):
             cells = [[row["row"], *_errors(row, kind, of, far)] for row in rows if of in row[kind]]
             lines += [*_table([header, *cells]), ""] if cells else []
         lines += _scales([row for row in rows if row["row"] not in (NOISE_FLOOR, LAST_MEASUREMENT)])
-        lines += self.outliers.lines()
+        lines += self.outliers.lines(how="every program finds them so")
         for note in self.notes:
             lines += textwrap.wrap(f"note: {note}", TEXT_WIDTH)
         return "\n".join(lines)

@@ -33,6 +33,7 @@ ROWS_OFF = (0, 1, 2, 3, 4, 8, 13, 21, 34)  # at either end of the best run, that
 MAX_LINES = 8  # of text
 MAX_RUNS = 12  # of a trajectory
 MAX_SHARE = 0.1  # of a column's cells: where more look wrong, the program is
+WRITES_WITHOUT = "`steady check --mask` writes the table without them"
 AS_TAILS = "readings are far off at all distances, as heavy tails have them: none is left out"
 NORMAL_MEDIAN = 0.6745  # of |z| of a standard normal
 PASSES_OF_SD = 3  # in which robust standard deviations are found
@@ -92,22 +93,33 @@ class Outliers:
     def shared_with(self, other: Outliers) -> Outliers:
         """Those of these drives that another program finds wrong too."""
         wrong = self.wrong & other.wrong
-        shared = [one for one in self.found if bool(wrong[one.rows[0] : one.rows[1] + 1, one.drive].any())]
-        return replace(self, found=shared, wrong=wrong)
+        shared = (self._narrowed(one, wrong) for one in self.found)
+        return replace(self, found=[one for one in shared if one is not None], wrong=wrong)
+
+    def _narrowed(self, run: Outlier, wrong: Tensor) -> Outlier | None:
+        """The rows and columns of a run in which cells are wrong."""
+        places = [self.data.measurement_names.index(name.removeprefix("y.")) for name in run.columns]
+        cells = wrong[run.rows[0] : run.rows[1] + 1, run.drive][:, places]
+        if not bool(cells.any()):
+            return None
+        rows = [run.rows[0] + row for row in cells.any(1).nonzero().flatten().tolist()]
+        columns = tuple(run.columns[at] for at in cells.any(0).nonzero().flatten().tolist())
+        begin, end = self.data.elapsed[[rows[0], rows[-1]], run.drive].tolist()
+        return replace(run, rows=(rows[0], rows[-1]), seconds=(begin, end), columns=columns)
 
     @property
     def cost(self) -> float:
         return sum(one.cost for one in self.found)
 
-    def lines(self, drives: str = "") -> list[str]:
-        """As text, the clearest first; empty where nothing is wrong. `drives` says which they are."""
+    def lines(self, drives: str = "", how: str = WRITES_WITHOUT) -> list[str]:
+        """As text, the clearest first; empty where nothing is wrong. `drives` says which they are, `how` what to do."""
         if not self.found:
             return []
         clearest = sorted(self.found, key=lambda one: -one.gain)
         more = len(clearest) - MAX_LINES
         count = f"{self.cells} reading{'s' * (self.cells > 1)}"
         of_which = f" of the {drives} drives" if drives else ""
-        lines = [f"{count}{of_which} left out as wrong (`steady check --mask` writes the table without them):"]
+        lines = [f"{count}{of_which} left out as wrong ({how}):"]
         lines += [f"  {one}" for one in clearest[:MAX_LINES]]
         return lines + [f"  and {more} more"] * (more > 0)
 

@@ -83,12 +83,12 @@ QUANTITIES = {
 
 def kept_columns(kind: Any) -> dict[str, Sequence[str]]:
     """Name of each quantity that a vehicle's class keeps, for its own lines and for its sensors → its states."""
+    if isinstance(kind.keeps, str) or not isinstance(kind.keeps, Sequence):
+        what = f"keeps is {kind.keeps!r}; one quantity is ('acceleration',)"
+        raise ProgramError(f"program {kind.__name__}: {what}", site="keeps")
     listed = kind.sensors if isinstance(kind.sensors, Sequence) else ()
     asked = (getattr(one, "keeps", ()) for one in listed if not isinstance(one, type))
     wanted = dict.fromkeys([*kind.keeps, *(name for names in asked for name in names)])
-    if isinstance(kind.keeps, str):
-        what = f"keeps is the text {kind.keeps!r}; one quantity is ({kind.keeps!r},)"
-        raise ProgramError(f"program {kind.__name__}: {what}", site="keeps")
     for name in wanted:
         if name not in QUANTITIES:
             what = f"keeps names {name!r}; a vehicle can keep {', '.join(QUANTITIES)}"

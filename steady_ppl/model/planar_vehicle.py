@@ -184,12 +184,14 @@ class PlanarVehicle(Program):
         for sensor, its in listed:
             for name, values in sensor.tells(its).items():
                 found.setdefault(name, (values, torch.zeros_like(values)))
-        found = found | {name: value for name, value in super().told(data).items() if name not in found}
+        listed_cells = torch.zeros_like(data.observed)  # what these tell is told; their names say nothing more
+        for at in columns.values():
+            listed_cells[..., list(at)] = data.observed[..., list(at)]
+        by_name = super().told(data.without(listed_cells))
+        found = {name: told for name, told in by_name.items() if not bool(told[0].isnan().all())} | found
         ranges = [its for sensor, its in listed if sensor.kind == "range"]
         ranges += [readings[..., list(at)] for kind, at in self.landmark_columns.items() if kind == "range"]
-        if (
-            "x" not in found and ranges and not isinstance(self.landmarks, Tensor)
-        ):  # a map that is learned tells nothing
+        if ranges and "x" not in found and not isinstance(self.landmarks, Tensor):  # a learned map tells nothing
             nearest = ranges[0].nan_to_num(math.inf).min(-1)
             away = torch.where(nearest.values.isinf(), torch.nan, nearest.values)
             places = away.new_tensor(self.landmarks)[nearest.indices] + 0 * away.unsqueeze(-1)

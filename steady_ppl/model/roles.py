@@ -34,16 +34,22 @@ def controls_of(program: Program, *roles: str) -> tuple[str, ...]:
     """Return the names of the controls that have some roles, in the order of the roles, without those that none has.
 
     A program declares `roles = {"delta": "steering"}`. A control that is called as a role has it by its name, unless
-    another one is declared to have it.
+    another one is declared to have it or its unit is another.
 
     Raises:
         ProgramError: `roles` is wrong; see `wrong_roles`.
     """
     for problem in wrong_roles(program):
         raise ProgramError(f"program {type(program).__name__}{problem}", site="roles")
-    found = {name: name for name in program.control_names if name not in program.roles}
+    unit_of = dict(zip(program.control_names, program.control_units, strict=True))
+    found = {name: name for name in unit_of if name not in program.roles and _fits(name, unit_of[name])}
     found |= {role: name for name, role in program.roles.items()}
     return tuple(found[role] for role in roles if role in found)
+
+
+def _fits(role: str, unit: str) -> bool:
+    """Whether a control with a unit, or none, can have a role by its name."""
+    return role in ROLES and (not unit or ROLES[role].unit in ("", unit))
 
 
 def wrong_roles(program: Program) -> Iterator[str]:

@@ -21,7 +21,7 @@ Setting = float | Sequence[float] | str
 
 
 def _is_number(value: Any) -> bool:
-    return isinstance(value, float | int) and math.isfinite(value)
+    return isinstance(value, float | int) and not isinstance(value, bool) and math.isfinite(value)
 
 
 def _is_positive(value: Any) -> bool:
@@ -37,6 +37,7 @@ _SETTINGS = {
     **dict.fromkeys(("sd", "heading_sd", "bearing_sd", "size"), (_is_positive, "a number above zero")),
     **dict.fromkeys(("angle", "left"), (_is_number, "a finite number")),
     "offset": (_is_place, "two numbers, m ahead and to the left"),
+    "from_north": (lambda value: isinstance(value, bool), "True or False"),
 }
 
 
@@ -72,7 +73,7 @@ class Sensor(ABC):
             raise ProgramError(f"a sensor's name is one word, got {self.name!r}", site="sensors")
         for what, value in vars(self).items():
             holds, expected = _SETTINGS.get(what, (None, ""))
-            if holds and not (isinstance(value, str) or holds(value)):
+            if holds and not ((isinstance(value, str) and what != "from_north") or holds(value)):
                 raise ProgramError(f"sensor {self.name}: {what} is {expected}, got {value!r}", site="sensors")
 
     @abstractmethod
@@ -90,7 +91,11 @@ class Sensor(ABC):
     def distribution(self, program: Any, state: Tensor) -> dist.Independent:
         """Of its readings, `(..., K)`."""
         kind = WrappedNormal if self.of_circle else dist.Normal
-        return kind(self.reading(program, state), setting(program, self.sd, state)).to_event(1)
+        reading, sd = self.reading(program, state), setting(program, self.sd, state)
+        if isinstance(sd, Tensor) and sd.dim() and sd.shape[-1] not in (1, reading.shape[-1]):
+            about = f"sensor {self.name} has {sd.shape[-1]} standard deviations for {reading.shape[-1]} columns"
+            raise ProgramError(f"program {type(program).__name__}: its {about}", site="sensors")
+        return kind(reading, sd).to_event(1)
 
     def observe(self, program: Any, state: Tensor) -> None:
         """Sample its readings at the site of its name."""

@@ -110,6 +110,16 @@ def test_a_program_with_heavy_tails_is_asked_about_every_reading(dragged, truth)
     assert line(found, "after")["against_reference"]["log_likelihood"]["difference"] > 5
 
 
+def test_different_priors_of_the_start_are_noted(truth):
+    boat = example("gps_boat", torch.float32).requires_grad_(False)
+    data = st.simulate(boat, 5, seed=1).without_truth()
+    seeing = example("gps_boat", torch.float32).requires_grad_(False)
+    seeing.start = "first measurements"
+    rows = {"declared": boat, "seeing": seeing}
+    found = prove(rows, data, known_start=False, with_constant_velocity=False, horizons=(1.0,))
+    assert [note for note in found.notes if note.startswith("seeing and declared have different priors of the start")]
+
+
 def test_the_noise_scales_are_the_programs(drag):
     scales = line(drag, "after")["scales"]
     assert scales["channels"] == pytest.approx({"forward [m/s²]": 0.08, "lateral [m/s²]": 0.08, "yaw [rad/s²]": 0.05})

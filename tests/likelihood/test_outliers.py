@@ -9,7 +9,7 @@ import torch
 
 import steady_ppl as st
 from steady_ppl.gaussian.smoother import find_path
-from steady_ppl.likelihood.outliers import AS_TAILS, find_outliers
+from steady_ppl.likelihood.outliers import AS_TAILS, Outlier, Outliers, find_outliers
 from steady_ppl.model.problem import Problem
 
 
@@ -96,3 +96,19 @@ def test_a_table_with_further_columns_loses_the_same_cells(boat, drives):
     left = found.without(more)
     lost = (more.observed & ~left.observed).nonzero().tolist()
     assert lost == [[30, 3, 1]] and float(left.measurements[30, 3, 1]) == 0
+
+
+def test_what_two_programs_find_wrong_is_told_as_narrow_as_it_is(drives):
+    def wrong(rows: slice, columns: slice) -> Outliers:
+        cells = torch.zeros_like(drives.observed)
+        cells[rows, 1, columns] = True
+        names = tuple(f"y.{name}" for name in drives.measurement_names[columns])
+        seconds = (float(drives.elapsed[rows.start, 1]), float(drives.elapsed[rows.stop - 1, 1]))
+        run = Outlier(1, drives.labels[1], (rows.start, rows.stop - 1), seconds, names, 9.0, 50.0, 5.0)
+        return Outliers(drives, [run], cells)
+
+    shared = wrong(slice(10, 21), slice(0, 3)).shared_with(wrong(slice(12, 14), slice(2, 3)))
+    (one,) = shared.found
+    assert (one.rows, one.columns, shared.cells) == ((12, 13), (f"y.{drives.measurement_names[2]}",), 2)
+    assert one.seconds == pytest.approx((1.2, 1.3))
+    assert not wrong(slice(10, 21), slice(0, 2)).shared_with(wrong(slice(12, 14), slice(2, 3))).found

@@ -25,7 +25,8 @@ def test_a_control_that_is_called_as_a_role_has_it() -> None:
     assert controls_of(example("car"), "speed", "steering", "turn") == ("speed", "steering")
     assert controls_of(example("hovercraft"), "right", "left") == ("right", "left")
     assert controls_of(driven(), *ROLES) == ()
-    assert controls_of(driven(*ROLES), *ROLES) == tuple(ROLES)  # in any unit, or in none
+    assert controls_of(driven(*ROLES), *ROLES) == tuple(ROLES)  # without a unit
+    assert controls_of(driven("speed [km/h]", "left [1]"), "speed", "left") == ("left",)
 
 
 def test_other_names_have_the_role_that_is_declared() -> None:

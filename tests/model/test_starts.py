@@ -190,3 +190,20 @@ def test_the_prior_is_told_by_measurements_alone(drives: st.Trajectories) -> Non
     assert not first.values  # hidden from handlers outside
     for mine, its in zip(centre_of_start(one, data), centre_of_start(other, data), strict=True):
         assert same(mine, its)
+
+
+def test_a_heading_whose_mount_is_learned_tells_nothing_by_its_name(drives: st.Trajectories) -> None:
+    class Turned(Car):
+        start = "first measurements"
+        sensors = (Position(sd=0.3, name="gps"), Heading(sd=0.05, angle="twist"))
+        twist = 1.5
+
+    class Mounted(Turned):
+        sensors = (Position(sd=0.3, name="gps"), Heading(sd=0.05, angle=0.5))
+
+    turned, mounted = Turned(), Mounted()
+    data = st.for_program(turned, st.simulate(turned, 3, seed=2))
+    told, known = turned.told(data), mounted.told(data)
+    assert "heading" not in told and {"x", "y"} <= told.keys()
+    heading = data.measurements[..., data.measurement_names.index("heading")]
+    torch.testing.assert_close(known["heading"][0], heading - 0.5)

@@ -261,7 +261,7 @@ def test_what_cannot_be_kept_is_said() -> None:
     class Text(type(example("unicycle"))):
         keeps = "control"
 
-    with pytest.raises(st.ProgramError, match=r"keeps is the text 'control'; one quantity is \('control',\)"):
+    with pytest.raises(st.ProgramError, match=r"keeps is 'control'; one quantity is \('acceleration',\)"):
         probe(Text())
 
     class Nothing(type(example("unicycle"))):
@@ -276,6 +276,12 @@ def test_what_cannot_be_kept_is_said() -> None:
     program.sensors = (Encoder(sd=0.1),)
     with pytest.raises(st.ProgramError, match="its sensor encoder keeps travelled: list `sensors` in the body of the"):
         probe(program)
+
+
+@pytest.mark.parametrize("keeps", [None, "acceleration", 3])
+def test_what_is_kept_is_a_list(keeps) -> None:
+    with pytest.raises(st.ProgramError, match=r"keeps is .*; one quantity is \('acceleration',\)"):
+        probe(carrying("unicycle", keeps=keeps))
 
 
 def test_a_subclass_calls_the_methods_of_its_parent() -> None:

@@ -118,6 +118,8 @@ def test_a_vehicle_without_a_list_has_an_observe_of_its_own() -> None:
     [
         (lambda: YawRate(sd=0.0), "sensor yaw_rate: sd is a number above zero, got 0.0"),
         (lambda: YawRate(sd=math.inf), "sd is a number above zero, got inf"),
+        (lambda: YawRate(sd=True), "sd is a number above zero, got True"),
+        (lambda: Heading(sd=0.1, from_north="no"), "from_north is True or False, got 'no'"),
         (lambda: YawRate(sd=None), "sd is a number above zero, got None"),
         (lambda: YawRate(sd=0.1, name=3), "a sensor's name is one word, got 3"),
         (lambda: WheelSpeed(sd=0.1, size=0), "sensor wheel_speed: size is a number above zero, got 0"),
@@ -358,3 +360,11 @@ def test_a_distance_has_a_slope_at_the_landmark() -> None:
     state = torch.zeros(1, 6, requires_grad=True)
     Unicycle().ranges(state).sum().backward()
     assert bool(torch.isfinite(state.grad).all())
+
+
+def test_standard_deviations_are_as_many_as_columns() -> None:
+    class Wrong(Unicycle):
+        sensors = (Position(sd=(0.1, 0.2, 0.3)),)
+
+    with pytest.raises(st.ProgramError, match="its sensor position has 3 standard deviations for 2 columns"):
+        probe(Wrong())

@@ -66,6 +66,7 @@ class LogColumn(Column):
 
     readings = ("angle", "degrees", "yaw", "angle from north", "degrees from north", "yaw from north", "east", "north")
     clocks = ("log", "sample", "gps")
+    lengths = ("east", "north")
     spelling: ClassVar[str] = rf"{FIELDS}( ?\| ?{FIELDS})*"
 
     when: str | None = None

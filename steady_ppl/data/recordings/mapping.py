@@ -38,6 +38,7 @@ class Column:
     """
 
     readings: ClassVar[tuple[str, ...]]
+    lengths: ClassVar[tuple[str, ...]] = ()  # of the readings; the others are angles
     clocks: ClassVar[tuple[str, ...]]
     spelling: ClassVar[str] = FIELD
 
@@ -51,6 +52,11 @@ class Column:
     late: float = 0.0
     scale: float = 1.0
     offset: float = 0.0
+
+    @property
+    def is_angle(self) -> bool:
+        """Whether its values live on a circle."""
+        return self.reading is not None and self.reading not in self.lengths
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "clock", self.clock or self.clocks[0])

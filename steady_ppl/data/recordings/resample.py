@@ -144,7 +144,7 @@ def _interpolated(one: Series, time: np.ndarray, most: float | None) -> np.ndarr
     times, values = one.times[kept], one.values[kept]
     if len(times) == 0 or len(time) == 0:
         return np.full(len(time), np.nan)
-    angle = one.column.reading is not None
+    angle = one.column.is_angle
     if angle:
         values = values - 2 * np.pi * np.append(0.0, np.rint(np.diff(values) / (2 * np.pi)).cumsum())
     after = np.searchsorted(times, time).clip(max=len(times) - 1)

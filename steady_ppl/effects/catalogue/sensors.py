@@ -258,7 +258,7 @@ def sensor_delay(self: Program, state: Tensor, measured: Tensor, c: Tensor, colu
 
 @declare(SENSORS, "viewpoint", "s", typical=0.12, limit=1.0, lacks=needs(RATES))
 def clock_offset(self: Program, state: Tensor, c: Tensor) -> Tensor:
-    r"""y(t) → y(t - c)
+    r"""y(t) → y(t - c), of what depends on the pose
 
     equation: y(t) \to y(t - c)
     feels: measurements show where it was a moment ago; below zero, commands are logged later than they act

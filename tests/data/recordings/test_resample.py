@@ -11,7 +11,7 @@ from bag_drives import SCAN, U, taken, values
 from bag_writing import Said, stamped, write_bag
 from hypothesis import given, settings, strategies as st
 
-from steady_ppl import BagColumn, BagMapping, DataError, read_bags
+from steady_ppl import BagColumn, BagMapping, DataError, LogColumn, read_bags
 from steady_ppl.data.recordings.resample import Series, align, in_rows
 
 MS = 1_000_000
@@ -185,3 +185,13 @@ def test_a_clock_with_offset_and_drift_is_aligned(tmp_path: Path, capsys, kind: 
     fine = taken(bag, BagColumn("y.u", "/u", "data"), column, step=0.001)  # the first is 4 ms late by `late` alone
     rows = fine.observed[:, 0, 1].nonzero()[:, 0].tolist()
     assert rows == [100 * i for i in range(200)]
+
+
+def test_metres_of_a_log_are_no_angles() -> None:
+    way = np.arange(100.0, 150.0, 5.0)  # more than half a turn from message to message
+    times = np.arange(len(way), dtype=np.int64) * 100 * MS
+    columns = [LogColumn(name, "a", "value") for name in ("u.a", "y.b")]
+    columns.append(LogColumn("x.x", "gps", "lat lon", reading="east"))
+    (piece,) = in_rows([Series(one, times, way) for one in columns], STEP, "log")
+    np.testing.assert_allclose(piece.cells["x.x"][: len(way)], way[: piece.rows])
+    assert columns[2].is_angle is False and LogColumn("x.h", "a", "yaw", reading="degrees").is_angle
