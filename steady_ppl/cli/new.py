@@ -126,9 +126,10 @@ def _vehicle(file: Path, kind: str | None, header: "Header | None", given: Mappi
     for name, control in given.items():
         if header is not None and not any(one.is_called(name) for one in header.of("u")):
             what = f"{header.name} has no column {shown(name, 40)}"
-            raise UsageError(f"--control {shown(name, 40)}={control}: {what}; it has {_names(header)}")
+            raise UsageError(f"--control {shown(name, 40)}={shown(control, 40)}: {what}; it has {_names(header)}")
         if kind is None and not any(control in it.program.control_names for it in known.values()):
-            raise UsageError(f"--control: no vehicle has a control {shown(control, 40)}; there are {listed}")
+            what = f"no vehicle has a control {shown(control, 40)}"
+            raise UsageError(f"--control {shown(name, 40)}={shown(control, 40)}: {what}; there are {listed}")
     if kind is None and header is not None:
         fitting = {one: found for one, it in known.items() if (found := controls_of(it, header, given)) is not None}
         if fitting:
@@ -204,7 +205,7 @@ def _y_names(header: "Header") -> str:
 
 def _take(parts: Parts, header: "Header", seen: "Seen", wanted: "_Wanted | None") -> None:
     """Put a sensor that a table has into the model."""
-    from steady_ppl.runs.table_header import required_settings
+    from steady_ppl.runs.table_header import Column, required_settings
 
     settings = {"name": seen.name} | (wanted.settings if wanted else {})
     own = parts.vehicle.own(seen.kind, seen.name)
@@ -223,6 +224,8 @@ def _take(parts: Parts, header: "Header", seen: "Seen", wanted: "_Wanted | None"
     if seen.others:
         parts.guessed.append(f"{seen.name}: {seen.kind.kind}; {' or '.join(seen.others)} fits as well")
     _add(parts, seen.kind, settings)
+    headings = [old for old, own in seen.columns.items() if own == f"{seen.name}_heading"]  # of a pose
+    parts.guessed += [_from_x(Column.parse(old).name) for old in headings]
     parts.columns |= {old: f"y.{name}" for old, name in seen.columns.items()}
     parts.landmarks = max(parts.landmarks, seen.landmarks)
 
@@ -240,10 +243,13 @@ def _add(parts: Parts, kind: "type[Sensor]", settings: Mapping[str, Any]) -> "Se
         elif name == "left" and value == 0:
             parts.guessed.append(f"{made.name}: left = 0 m, it stands on the middle line")
         elif name == "from_north" and not value:
-            how = f"--sensor heading={made.name},from_north=true"
-            parts.guessed.append(f"{made.name} counts from x anticlockwise; if from north: {how}")
+            parts.guessed.append(_from_x(made.name))
     parts.sensors.append(made)
     return made
+
+
+def _from_x(name: str) -> str:
+    return f"{name} counts from x anticlockwise; if from north: --sensor heading={name},from_north=true"
 
 
 def _kind(seen: "Seen") -> str:

@@ -189,7 +189,7 @@ class Header:
         for label in pd.unique(labels):
             values = self.numbers(column)[labels == label]
             found.append(np.diff(values[np.isfinite(values)], 3))
-        every = np.abs(np.concatenate(found))
+        every = np.abs(np.concatenate([np.empty(0), *found]))
         every = every[every > 0]
         if len(every) < MIN_READINGS:
             return None

@@ -101,7 +101,7 @@ def test_the_section_of_the_page_is_what_it_says(log: Path, monkeypatch, capsys)
         ("no.csv: there is no such file", ["no.csv"]),
         ("its columns have other names than a model's", ["log.csv"]),
         ("log.csv: which columns are speed [m/s], turn [rad/s]? say it", ["log.csv", "--vehicle", "unicycle"]),
-        ("--control: no vehicle has a control foo; there are car", ["log.csv", "--control", "v=foo"]),
+        ("--control v=foo: no vehicle has a control foo; there are car", ["log.csv", "--control", "v=foo"]),
         ("log.csv: no vehicle has its controls (v_kmh,", ["log.csv", "--control", "v=turn"]),
         ("log.csv has no columns of compass in rad; it has", ["log.csv", "--sensor", "heading=compass:0.1"]),
         (
@@ -183,6 +183,10 @@ def test_the_simplest_vehicle_is_taken_and_a_compass_s_north_is_asked_for(tmp_pa
     told = guessed_of(tmp_path, capsys, columns, *north.partition("north: ")[2].split())
     assert not any("counts from" in one for one in told)
     assert {one.name: one for one in st.load_program(tmp_path / "mine.py").sensors}["compass"].from_north is True
+    (north,) = [one for one in guessed_of(tmp_path, capsys, f"{columns[:-9]} y.gps_heading") if "counts from" in one]
+    assert (
+        north == "gps_heading counts from x anticlockwise; if from north: --sensor heading=gps_heading,from_north=true"
+    )
     told = guessed_of(tmp_path, capsys, "u.left u.right y.gps_x y.gps_y y.compass")
     assert told[0] == "the vehicle: thruster_boat; --vehicle planar_quadrotor fits as well"
 
@@ -200,7 +204,7 @@ def test_units_that_nobody_said_are_listed(tmp_path: Path, capsys) -> None:
 @pytest.mark.parametrize(
     ("says", "cells", "renamed"),
     [
-        ("u.steering", {"u.steering": np.nan}, {}),
+        ("column u.steering, trajectory 1, row 1: got an empty cell", {"u.steering": np.nan}, {}),
         ("there is no column trajectory: name a table", {}, {"trajectory": None}),
         ("are these microseconds? call it timestamp_us", {"time": 1e5 * np.arange(40)}, {"time": "timestamp"}),
         ("begins at 1.7e+09, rows are 60 apart: are these milliseconds?", {"time": 1.7e9 + 60 * np.arange(40)}, {}),
