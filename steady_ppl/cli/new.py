@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from steady_ppl.sensors import Sensor
 
 SENSOR_FORM = "KIND[=NAME][:SD][,SETTING=VALUE]..."
+MIN_STICK, MIN_DEGREES = 1.3, 2.0  # of a steering angle's size, beyond which it is none in rad
 
 
 @dataclass
@@ -64,7 +65,7 @@ def new(
     from steady_ppl.runs.vehicle_parts import needs_landmarks, sensor_kinds, write_model
 
     header = None if table is None else Header.read(table)
-    given = dict(_control(text) for text in control or [])
+    given = _controls(control or [])
     parts = _vehicle(file, vehicle, header, given)
     kinds = sensor_kinds()
     wanted = [_sensor(text, kinds) for text in sensor or []]
@@ -94,18 +95,20 @@ def new(
     renamed = {} if header is None else {old: now for old, now in parts.columns.items() if old != now}
     if header is not None:
         renamed |= {name: "" for name in (header.time,) if name != "time"}
-        renamed |= {"trajectory": ""} if header.label != "trajectory" else {}
-        _require_table_out(table, table_out, renamed, force)
+        renamed |= {header.label: ""} if header.label not in (None, "trajectory") else {}
+        _require_table_out(header, table_out, renamed, force)
+    drives = None if header is None else _read(parts, header)
     raw = [raw for raw, called in parts.columns.items() if called.startswith("u.")]
     units = zip(raw, parts.vehicle.program.control_units, strict=True) if header else ()
     speeds = [header.largest(name) for name, unit in units if header and unit == "m/s"]
     given_parts: Any = {"controls": parts.controls, "sensors": parts.sensors, "landmarks": places}
     program = write_model(file, parts.vehicle, **given_parts, fastest=max(speeds, default=0.0), force=force)
-    place = _table(header, table, table_out, parts, bool(renamed))
+    place = table_out if header and table_out else table
+    if drives is not None and table_out is not None:
+        st.write_table(drives, table_out)
     _report(file, parts, header, place)
-    if place is not None:
-        drives = st.for_program(program, st.read_table(place))
-        for finding in st.doctor(drives, program).findings:
+    if drives is not None and place is not None:
+        for finding in st.doctor(st.for_program(program, drives), program).findings:
             say(f"{place.name}: {finding} (`steady doctor {shlex.quote(str(place))}` says how to mend it)")
     read = shlex.quote(str(place)) if place is not None else "TRAIN.csv"
     out = shlex.quote(f"runs/{file.stem}")
@@ -119,18 +122,32 @@ def _vehicle(file: Path, kind: str | None, header: "Header | None", given: Mappi
     from steady_ppl.runs.vehicle_parts import vehicles
 
     known = vehicles()
-    listed = ", ".join(f"{one} ({', '.join(it.program.control_names)})" for one, it in known.items())
+    listed = ", ".join(f"{one} ({', '.join(it.program.controls)})" for one, it in known.items())
+    for name, control in given.items():
+        if header is not None and not any(one.is_called(name) for one in header.of("u")):
+            what = f"{header.name} has no column {shown(name, 40)}"
+            raise UsageError(f"--control {shown(name, 40)}={shown(control, 40)}: {what}; it has {_names(header)}")
+        if kind is None and not any(control in it.program.control_names for it in known.values()):
+            what = f"no vehicle has a control {shown(control, 40)}"
+            raise UsageError(f"--control {shown(name, 40)}={shown(control, 40)}: {what}; there are {listed}")
     if kind is None and header is not None:
         fitting = {one: found for one, it in known.items() if (found := controls_of(it, header, given)) is not None}
         if fitting:
             y_columns = {one.name for one in header.of("y")}
 
-            def rank(one: str) -> tuple[bool, int, int]:
+            def rank(one: str) -> tuple[bool, int, bool, int]:
+                """Controls of other names; whether it lacks the first column of its own; its parameters."""
                 program = known[one].program
-                exact = len(y_columns & {*program.measurement_names})
-                return one != file.stem, -exact, sum(value.numel() for value in program.parameters())
+                others = sum(
+                    own not in (column.name, *given.values())
+                    for own, column in zip(program.control_names, fitting[one], strict=True)
+                )
+                size = sum(value.numel() for value in program.parameters())
+                return one != file.stem, others, program.measurement_names[0] not in y_columns, size
 
             kind, *others = sorted(fitting, key=rank)
+            units = known[kind].program.control_units
+            others = [one for one in others if known[one].program.control_units == units]
             guessed = [f"the vehicle: {kind}" + (f"; --vehicle {' or '.join(others)} fits as well" if others else "")]
             return _with_controls(known[kind], fitting[kind], guessed)
     kind = kind or _asked(f"Vehicle: {listed}")
@@ -140,7 +157,7 @@ def _vehicle(file: Path, kind: str | None, header: "Header | None", given: Mappi
         raise UsageError(f"{wrong}{how}; there are {listed}")
     if kind not in known:
         raise UsageError(f"--vehicle {shown(kind, 40)}: there is no such vehicle; there are {listed}")
-    own = known[kind].program.control_names
+    own, units = known[kind].program.control_names, known[kind].program.controls
     if strange := {*given.values()} - {*own}:
         raise UsageError(f"--control: {kind} has no control {', '.join(strange)}; it has {', '.join(own)}")
     if header is None:
@@ -148,7 +165,7 @@ def _vehicle(file: Path, kind: str | None, header: "Header | None", given: Mappi
         return Parts(known[kind], [names.get(one, one) for one in own])
     found = controls_of(known[kind], header, given)
     if found is None:
-        what = f"{header.name}: which columns are {', '.join(own)}?"
+        what = f"{header.name}: which columns are {', '.join(units)}?"
         raise UsageError(f"{what} say it by --control COLUMN=CONTROL; it has {_names(header)}")
     return _with_controls(known[kind], found, [])
 
@@ -166,15 +183,19 @@ def _read_sensors(
     parts: Parts, header: "Header", kinds: "Mapping[str, type[Sensor]]", wanted: "Sequence[_Wanted]"
 ) -> None:
     """The sensors that are asked for and those that the columns say, with the columns' names."""
-    from steady_ppl.runs.table_header import sensors_in
+    from steady_ppl.runs.table_header import example, sensors_in
+    from steady_ppl.runs.vehicle_parts import columns_of
 
     for one in wanted:
         found = sensors_in(header, [one.kind], parts.columns, one.name)
         if not found:
-            what = f"{header.name} has no columns of {one.name or one.kind.kind}"
+            units = dict.fromkeys(columns_of(example(one.kind, "n"), 1).values())
+            what = f"{header.name} has no columns of {one.name or one.kind.kind} in {', '.join(units)}"
             raise UsageError(f"--sensor {one.text}: {what}; it has {_y_names(header)}")
         _take(parts, header, found[0], one)
-    for seen in sensors_in(header, list(kinds.values()), parts.columns):
+    own = parts.vehicle.program.sensors
+    found = sensors_in(header, list(kinds.values()), parts.columns, own=own)
+    for seen in sorted(found, key=lambda seen: seen.name not in [one.name for one in own]):
         _take(parts, header, seen, None)
 
 
@@ -184,8 +205,7 @@ def _y_names(header: "Header") -> str:
 
 def _take(parts: Parts, header: "Header", seen: "Seen", wanted: "_Wanted | None") -> None:
     """Put a sensor that a table has into the model."""
-    from steady_ppl.runs.table_header import required_settings
-    from steady_ppl.runs.vehicle_parts import with_settings
+    from steady_ppl.runs.table_header import Column, required_settings
 
     settings = {"name": seen.name} | (wanted.settings if wanted else {})
     own = parts.vehicle.own(seen.kind, seen.name)
@@ -201,9 +221,35 @@ def _take(parts: Parts, header: "Header", seen: "Seen", wanted: "_Wanted | None"
         settings[setting] = value
         how = "from differences of neighbouring readings" if noises else "as in the vehicle's file"
         parts.guessed.append(f"{setting} of {seen.name}: {value:g} ({how})")
-    parts.sensors.append(with_settings(seen.kind, settings, parts.vehicle))
+    if seen.others:
+        parts.guessed.append(f"{seen.name}: {seen.kind.kind}; {' or '.join(seen.others)} fits as well")
+    _add(parts, seen.kind, settings)
+    headings = [old for old, own in seen.columns.items() if own == f"{seen.name}_heading"]  # of a pose
+    parts.guessed += [_from_x(Column.parse(old).name) for old in headings]
     parts.columns |= {old: f"y.{name}" for old, name in seen.columns.items()}
     parts.landmarks = max(parts.landmarks, seen.landmarks)
+
+
+def _add(parts: Parts, kind: "type[Sensor]", settings: Mapping[str, Any]) -> "Sensor":
+    """Put a sensor into the model, and list what nobody said of it."""
+    from steady_ppl.runs.vehicle_parts import with_settings
+
+    made = with_settings(kind, settings, parts.vehicle, parts.sensors)
+    like = parts.vehicle.own(kind, settings.get("name", ""))
+    for name in (one.name for one in fields(made) if one.name not in ("name", *settings)):
+        value, own = getattr(made, name), getattr(like, name, None)
+        if isinstance(own, str) and value != own:
+            parts.guessed.append(f"{name} of {made.name}: {value or 'none'} ({own} is that of another sensor)")
+        elif name == "left" and value == 0:
+            parts.guessed.append(f"{made.name}: left = 0 m, it stands on the middle line")
+        elif name == "from_north" and not value:
+            parts.guessed.append(_from_x(made.name))
+    parts.sensors.append(made)
+    return made
+
+
+def _from_x(name: str) -> str:
+    return f"{name} counts from x anticlockwise; if from north: --sensor heading={name},from_north=true"
 
 
 def _kind(seen: "Seen") -> str:
@@ -222,17 +268,14 @@ def _columns_for(setting: str, seen: "Seen") -> list[str]:
 
 def _own_sensors(parts: Parts, wanted: "Sequence[_Wanted]") -> None:
     """The sensors that are asked for; where none are, the vehicle's own."""
-    from steady_ppl.runs.vehicle_parts import with_settings
-
     if not wanted:
         parts.sensors = list(parts.vehicle.program.sensors)
         parts.guessed.append("the sensors: those of the vehicle's own file")
     for one in wanted:
         try:
-            made = with_settings(one.kind, one.settings, parts.vehicle)
+            made = _add(parts, one.kind, one.settings)
         except TypeError:
             raise UsageError(f"--sensor {one.text}: its standard deviation is missing: {SENSOR_FORM}") from None
-        parts.sensors.append(made)
         if "sd" not in one.settings:
             parts.guessed.append(f"sd of {made.name}: {made.sd} (as in the vehicle's file)")
 
@@ -259,7 +302,7 @@ def _sensor(text: str, kinds: "Mapping[str, type[Sensor]]") -> _Wanted:
     found = found or next((one for one in kinds.values() if one.__name__.lower() == kind.strip().lower()), None)
     if found is None:
         raise UsageError(f"--sensor {shown(text, 60)}: no kind of sensor is {shown(kind, 40)!r}; {_kinds(kinds)}")
-    there = [one.name for one in fields(found)]
+    there = {one.name: one.default for one in fields(found)}
     settings: dict[str, Any] = {"name": name.strip()} if name else {}
     if sd:
         settings["sd"] = _value(sd)
@@ -269,7 +312,11 @@ def _sensor(text: str, kinds: "Mapping[str, type[Sensor]]") -> _Wanted:
             raise UsageError(
                 f"--sensor {shown(text, 60)}: {shown(setting, 40)!r} is no setting; there are {', '.join(there)}"
             )
-        settings[setting.strip()] = _value(value)
+        read, is_flag = _value(value), isinstance(there[setting.strip()], bool)
+        if isinstance(read, bool) != is_flag:
+            what = "is true or false" if is_flag else "is not true or false"
+            raise UsageError(f"--sensor {shown(text, 60)}: {setting.strip()} {what}, got {shown(value, 40)!r}")
+        settings[setting.strip()] = read
     try:
         found(**({"sd": 1.0} | {one: 1.0 for one in there if one.endswith("_sd")} | settings))
     except SteadyError as error:
@@ -302,11 +349,19 @@ def _kinds(kinds: "Mapping[str, type[Sensor]]") -> str:
     return f"there are {', '.join(kinds)}"
 
 
-def _control(text: str) -> tuple[str, str]:
-    column, equals, own = text.partition("=")
-    if not (equals and column.strip() and own.strip()):
-        raise UsageError(f"--control {shown(text, 60)}: expected COLUMN=CONTROL, as delta=steering")
-    return column.strip().removeprefix("u."), own.strip()
+def _controls(texts: Sequence[str]) -> dict[str, str]:
+    """The control that each column is."""
+    given = dict[str, str]()
+    for text in texts:
+        column, equals, own = (part.strip() for part in text.partition("="))
+        column = column.removeprefix("u.")
+        if not (equals and column and own):
+            raise UsageError(f"--control {shown(text, 60)}: expected COLUMN=CONTROL, as delta=steering")
+        if column in given or own in given.values():
+            twice = column if column in given else own
+            raise UsageError(f"--control {shown(text, 60)}: {shown(twice, 40)} is named twice")
+        given[column] = own
+    return given
 
 
 def _landmark(text: str) -> tuple[float, float]:
@@ -327,30 +382,49 @@ def _asked(question: str) -> str | None:
     return answer or None
 
 
-def _require_table_out(table: Path | None, out: Path | None, renamed: Mapping[str, str], force: bool) -> None:
+def _require_table_out(header: "Header", out: Path | None, renamed: Mapping[str, str], force: bool) -> None:
     from steady_ppl.data.table import require_table_file
 
     if out is not None:
         require_table_file(out)
-        if table is not None and out.exists() and out.samefile(table):
+        if out.exists() and out.samefile(header.path):
             raise UsageError(f"--table-out {out} is the table itself: choose another name")
         if out.exists() and not force:
             raise UsageError(f"{out} exists: choose another name, or --force to overwrite")
-    elif renamed:
-        what = f"{table}: its columns have other names than a model's ({shown(', '.join(renamed), 100)})"
-        raise UsageError(f"{what}: name a table to write with the right ones, --table-out drives.csv")
+        return
+    wrong = [] if header.label else ["there is no column trajectory"]
+    if renamed:
+        wrong.append(f"its columns have other names than a model's ({shown(', '.join(renamed), 100)})")
+    if wrong:
+        how = "name a table to write with the right ones, --table-out drives.csv"
+        raise UsageError(f"{header.path}: {', and '.join(wrong)}: {how}")
 
 
-def _table(
-    header: "Header | None", table: Path | None, out: Path | None, parts: Parts, has_other_names: bool
-) -> Path | None:
-    """The table that the model reads, written where it has to be."""
-    if header is None or (out is None and not has_other_names):
-        return table
-    assert out is not None
-    kept = parts.columns | {one.raw: one.raw for one in header.columns if one.group == "x"}
-    st.write_table(header.as_table(kept), out)
-    return out
+def _read(parts: Parts, header: "Header") -> st.Trajectories:
+    """The table as the model reads it, checked; list what its units are taken to be."""
+    from steady_ppl.runs.table_header import Column
+    from steady_ppl.runs.vehicle_parts import columns_of
+
+    drives = header.as_table(parts.columns | {one.raw: one.raw for one in header.columns if one.group == "x"})
+    program = parts.vehicle.program
+    header.require_seconds(program.step)
+    called = [f"u.{name}" for name in parts.controls]
+    units = dict(zip(called, program.control_units, strict=True))
+    roles = dict(zip(called, (program.roles.get(own, own) for own in program.control_names), strict=True))
+    for one in parts.sensors:
+        units |= {f"y.{name}": unit for name, unit in columns_of(one, parts.landmarks).items()}
+    taken: dict[str, list[str]] = {}
+    for raw, name in parts.columns.items():
+        if units[name] and not Column.parse(raw).unit:
+            taken.setdefault(units[name], []).append(raw)
+            largest = header.largest(raw) if roles.get(name) in ("steering", "rudder") else 0.0
+            if largest == 1.0 or largest >= MIN_STICK:
+                what = "degrees" if largest > MIN_DEGREES else "a share of full lock"
+                parts.guessed.append(f"{raw} looks like {what}, not rad")
+    for unit, raws in taken.items():
+        is_taken = "is taken" if len(raws) == 1 else "are taken"
+        parts.guessed.append(f"{shown(', '.join(raws), 80)} {is_taken} in {unit}")
+    return drives
 
 
 def _report(file: Path, parts: Parts, header: "Header | None", place: Path | None) -> None:

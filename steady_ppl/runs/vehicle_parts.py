@@ -1,7 +1,6 @@
 """A model file from parts: the text of a vehicle of `models/`, with other controls, sensors and landmarks."""
 
 import ast
-import dataclasses
 import inspect
 import json
 import keyword
@@ -17,6 +16,7 @@ import steady_ppl.sensors
 from steady_ppl.errors import UsageError
 from steady_ppl.model.loading import load_program
 from steady_ppl.model.program import FIRST_MEASUREMENTS, Program, names, units
+from steady_ppl.model.roles import ROLES
 from steady_ppl.model.validate import probe
 from steady_ppl.runs.workbench import workbench
 from steady_ppl.sensors import Sensor
@@ -49,10 +49,15 @@ class Vehicle:
         return re.split(r"[:;\n]|, with ", said)[0].rstrip(".")
 
     def own(self, kind: type[Sensor], name: str) -> Sensor | None:
-        """Its sensor of a class: the one of a name, or the only one."""
+        """Its sensor of a class: the one of a name, or the only one that is not on the other side by its name."""
         listed = [one for one in self.program.sensors if type(one) is kind]
         named = [one for one in listed if one.name == name]
-        return named[0] if named else listed[0] if len(listed) == 1 else None
+        fitting = named or [one for one in listed if len(_sides(one.name) | _sides(name)) < 2]
+        return fitting[0] if len(fitting) == 1 else None
+
+
+def _sides(name: str) -> set[str]:
+    return {"left", "right"} & {*name.lower().split("_")}
 
 
 def vehicles() -> dict[str, Vehicle]:
@@ -189,8 +194,11 @@ class _Text:
         ]
         lines = _listed("controls", [json.dumps(one, ensure_ascii=False) for one in declared])
         known = getattr(program, "roles", {})
-        roles = {name: known.get(own, own) for name, own in zip(controls, program.control_names, strict=True)}
-        told = ", ".join(f'"{name}": "{role}"' for name, role in roles.items() if name != role)
+        told = ", ".join(
+            f'"{name}": "{role}"'
+            for name, own, unit in zip(controls, program.control_names, program.control_units, strict=True)
+            if (role := known.get(own, own)) in ROLES and name != role and ROLES[role].unit in ("", unit)
+        )
         return f"{lines}\n    roles = {{{told}}}  # what each control is" if told else lines
 
     @staticmethod
@@ -258,11 +266,14 @@ def as_code(sensor: Sensor) -> str:
     return f"{type(sensor).__name__}({', '.join(parts)})"
 
 
-def with_settings(kind: type[Sensor], settings: Mapping[str, Any], vehicle: Vehicle) -> Sensor:
-    """A sensor with some settings, the others as the vehicle's own of its class has them."""
-    like = vehicle.own(kind, settings.get("name", ""))
-    own = {} if like is None else {field.name: getattr(like, field.name) for field in dataclasses.fields(like)}
-    own.pop("name", None)
+def with_settings(
+    kind: type[Sensor], settings: Mapping[str, Any], vehicle: Vehicle, others: Sequence[Sensor] = ()
+) -> Sensor:
+    """A sensor with some settings, the rest as the vehicle's own of its class has them, but for names of parameters
+    that other sensors' settings are."""
+    like, taken = vehicle.own(kind, settings.get("name", "")), _names_of(others)
+    own = {} if like is None else {one.name: getattr(like, one.name) for one in fields(like) if one.name != "name"}
+    own = {name: value for name, value in own.items() if not (isinstance(value, str) and value in taken)}
     return kind(**(own | dict(settings)))
 
 

@@ -10,7 +10,7 @@ import pandas as pd
 import pytest
 
 from steady_ppl.errors import DataError
-from steady_ppl.runs.table_header import Column, Header, controls_of, sensors_in
+from steady_ppl.runs.table_header import KINDS, Column, Header, controls_of, sensors_in
 from steady_ppl.runs.vehicle_parts import sensor_kinds, vehicles
 
 
@@ -32,21 +32,38 @@ def seen(found: Header, *taken: str) -> dict[str, tuple[str, list[str]]]:
 
 
 @pytest.mark.parametrize(
-    ("raw", "stem", "factor"),
+    ("raw", "stem", "factor", "unit"),
     [
-        ("u.v", "v", 1.0),
-        ("delta [deg]", "delta", math.pi / 180),
-        ("y.compass_deg", "compass", math.pi / 180),
-        ("speed_kmh", "speed", 1 / 3.6),
-        ("v_ms", "v_ms", 1.0),
-        ("t_ms", "t", 0.001),
-        ("y.gps_x", "gps_x", 1.0),
-        ("range (cm)", "range", 0.01),
+        ("u.v", "v", 1.0, ""),
+        ("delta [deg]", "delta", math.pi / 180, "rad"),
+        ("y.compass_deg", "compass", math.pi / 180, "rad"),
+        ("speed_kmh", "speed", 1 / 3.6, "m/s"),
+        ("v_ms", "v_ms", 1.0, ""),
+        ("t_ms", "t", 0.001, "s"),
+        ("y.gps_x", "gps_x", 1.0, ""),
+        ("pos_n", "pos_n", 1.0, ""),
+        ("range (cm)", "range", 0.01, "m"),
+        ("u.left [N]", "left", 1.0, "N"),
+        ("y.level [V]", "level", 1.0, "V"),
     ],
 )
-def test_a_column_is_parted_into_name_and_unit(raw: str, stem: str, factor: float) -> None:
+def test_a_column_is_parted_into_name_and_unit(raw: str, stem: str, factor: float, unit: str) -> None:
     column = Column.parse(raw)
-    assert (column.stem, column.factor) == (stem, pytest.approx(factor))
+    assert (column.stem, column.factor, column.unit) == (stem, pytest.approx(factor), unit)
+
+
+def test_words_are_of_kinds_that_there_are(tmp_path: Path) -> None:
+    assert {*KINDS} <= {one.kind for one in sensor_kinds().values()}
+    assert seen(header(tmp_path, "t", "y.imu_forward", "y.imu_lateral")) == {
+        "imu": ("accelerometer", ["imu_forward", "imu_lateral"])
+    }
+
+
+def test_a_unit_of_another_kind_is_none_of_it(tmp_path: Path) -> None:
+    assert seen(header(tmp_path, "t", "y.wheel [m]", "y.gyro [V]")) == {}
+    thrusts = header(tmp_path, "t", "left [N]", "right [N]")
+    assert controls_of(vehicles()["differential_drive"], thrusts, {}) is None
+    assert controls_of(vehicles()["thruster_boat"], thrusts, {}) is not None
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,15 @@ from examples import MODELS
 import steady_ppl as st
 from steady_ppl.errors import UsageError
 from steady_ppl.runs.table_header import required_settings
-from steady_ppl.runs.vehicle_parts import as_code, needs_landmarks, sensor_kinds, vehicles, with_settings, write_model
+from steady_ppl.runs.vehicle_parts import (
+    Vehicle,
+    as_code,
+    needs_landmarks,
+    sensor_kinds,
+    vehicles,
+    with_settings,
+    write_model,
+)
 from steady_ppl.sensors import Bearings, Heading, Position, Ranges, WheelSpeed
 
 MAP = ((0.0, 0.0), (6.0, 0.0), (6.0, 10.0))
@@ -38,6 +46,15 @@ def test_every_vehicle_carries_every_sensor(kind: str, sensor: str, tmp_path: Pa
     drives = st.for_program(program, st.simulate(program, 2, seed=0))
     assert len(drives) == 2
     assert max(map(len, (tmp_path / "my_own.py").read_text().splitlines())) <= 120
+
+
+def test_a_control_without_a_role_is_given_none(tmp_path: Path) -> None:
+    """Its vehicle is somebody's own: what it is told is no role, or in another unit than the role has."""
+    text = (MODELS / "car.py").read_text().replace('"speed [m/s]", "steering [rad]"', '"speed [V]", "valve"')
+    (tmp_path / "car.py").write_text(text)
+    own = Vehicle("car", tmp_path / "car.py")
+    program = write_model(tmp_path / "mine.py", own, controls=("a", "b"), sensors=[Position(sd=1.0)])
+    assert program.control_names == ("a", "b") and not program.roles
 
 
 def test_a_setting_that_nothing_asks_for_is_taken_out(tmp_path: Path) -> None:
