@@ -380,7 +380,9 @@ def test_a_program_that_no_filter_follows_is_named_in_the_sentence(drag, who: st
     assert "by particles log p(y) is not finite" in infinite.figures["verdict"]
 
 
-@pytest.mark.parametrize("factor", [0.02, 0.03, 0.05, 0.1, 0.2])
+@pytest.mark.parametrize(
+    "factor", [0.02, *(pytest.param(one, marks=pytest.mark.slow) for one in (0.03, 0.05, 0.1, 0.2))]
+)
 def test_programs_that_lose_to_what_knows_nothing_are_said_to_be_no_models(dragged, factor: float) -> None:
     wrong, worse = hovercraft(), hovercraft()
     wrong.mass, worse.mass = (torch.tensor(1.5 * size) for size in (factor, 0.8 * factor))
