@@ -16,6 +16,7 @@ from steady_ppl.discovery.refits import BY_LIKELIHOOD, NO_THRESHOLD, Refit
 from steady_ppl.errors import FilterError
 from steady_ppl.utils.text import reason_of
 
+WITHIN_ROWS = "between"  # the form of effects that no state can tell
 MIN_GAIN_OF_CURVE = 3.0  # nats by which a curve must be better than named effects
 CLEAR_EVIDENCE = 10.0  # nats by which the tests must tell more of a curve than of an effect to deny it
 MAX_RATIO_OF_CURVE = 2.0  # of what a curve brings and an effect of another kind that is added all the same
@@ -106,8 +107,8 @@ class CurveJudge:
 
     def admits(self, candidate: Candidate) -> bool:
         """Whether a candidate is like the curve or brings half as much; if it imitates whatever is missing, whether the
-        curve brings nothing."""
-        if self.tested is None:
+        curve brings nothing. How controls go within a row is a matter of the table, whatever a curve brings."""
+        if self.tested is None or candidate.variant.effect.form == WITHIN_ROWS:
             return True
         if candidate.is_explanation:
             tests = self.screening.tests
