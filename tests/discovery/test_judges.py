@@ -162,8 +162,8 @@ class Curved:
         given = {"is_curve": is_curve, "statistic": statistic, "p_value": p_value, "evidence": evidence}
         return SimpleNamespace(variant=SimpleNamespace(name=name, label=name, at="forward~velocity"), **given)
 
-    def candidate(self, total=14.0, explains=True, label="saturation"):
-        variant = SimpleNamespace(name="saturation", label=label)
+    def candidate(self, total=14.0, explains=True, label="saturation", form="history"):
+        variant = SimpleNamespace(name="saturation", label=label, effect=SimpleNamespace(form=form))
         given = {"tested": self.saturation, "variant": variant, "refit": object.__new__(Refit)}
         return SimpleNamespace(**given, total=total, is_explanation=explains)
 
@@ -197,6 +197,12 @@ def test_what_imitates_anything_enters_where_no_curve_brings_something(monkeypat
     curved = Curved(monkeypatch, gain=gain, p_value=p_value, behind=[0, 1])
     assert curved.judge.admits(curved.candidate(total=500.0, explains=False)) == admitted
     assert curved.fits == [False] * (p_value < 0.01)
+
+
+def test_a_curve_is_no_rival_of_how_controls_go_within_a_row(monkeypatch):
+    curved = Curved(monkeypatch, gain=1000.0)
+    assert curved.judge.admits(curved.candidate(form="between"))
+    assert not curved.fits and not curved.judge.admits(curved.candidate())
 
 
 def test_a_curve_that_was_given_up_beside_one_candidate_is_fitted_again_beside_another(monkeypatch):
