@@ -32,6 +32,7 @@ from steady_ppl.likelihood.outliers import find_outliers
 from steady_ppl.likelihood.parameters import elements
 from steady_ppl.model.problem import Problem
 from steady_ppl.model.program import Program
+from steady_ppl.model.substeps import with_substeps
 from steady_ppl.runs.diagnostics import diagnose_units
 from steady_ppl.runs.fit import Fit
 from steady_ppl.runs.folder import JOURNAL, require_same, run_folder, write_record
@@ -231,7 +232,8 @@ def _doubts(found: Search, is_fitted: bool) -> list[str]:
 def _as_written(program: Program) -> Program:
     """The program as its file declares it, with the effects that were added to it."""
     with torch.random.fork_rng():
-        return restore(written_class(program)(), record(program)).to(next(program.parameters(), torch.zeros(())).dtype)
+        written = with_substeps(written_class(program)(), program.substeps)
+        return restore(written, record(program)).to(next(program.parameters(), torch.zeros(())).dtype)
 
 
 def _notes(found: Search) -> list[str]:

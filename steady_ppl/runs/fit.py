@@ -155,11 +155,11 @@ class Fit(Displayed):
             raise RunError(f"{folder}: its {command} has not finished: go on with it by `steady {command} … --resume`")
         if not isinstance(program, Program):
             program = _load_recorded(folder, record["program"], program)
-        effects.restore(program, record["effects"])
         substeps = record["substeps"]
         if not is_count(substeps):
             raise RunError(f"{folder / RUN_RECORD} is damaged: {substeps} substeps a row")
         program.substeps = substeps
+        effects.restore(program, record["effects"])
         tensors, _ = read_tensors(folder / PARAMETERS)
         expected = {(name, value.shape) for name, value in program.state_dict().items()}
         found = {(name, value.shape) for name, value in tensors.items()}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pyro
@@ -13,9 +14,9 @@ from pyro.distributions import constraints
 from pyro.nn import PyroParam
 from torch import tensor
 
-from steady_ppl import Program, UsageError, for_program, from_arrays, seeded, stack, with_substeps
+from steady_ppl import Fit, Program, UsageError, for_program, from_arrays, load_program, seeded, stack, with_substeps
 from steady_ppl.discovery.effect_scores import Scoring, columns_of
-from steady_ppl.effects import catalogue, chosen_variant, with_effect
+from steady_ppl.effects import catalogue, chosen_variant, with_effect, write_program
 from steady_ppl.gaussian.smoother import find_path, smooth
 from steady_ppl.likelihood.maximize import fit_by_likelihood
 from steady_ppl.likelihood.parameter_posterior import ridged_inverse
@@ -142,3 +143,15 @@ def test_exported_dynamics_remember_the_command_before() -> None:
     program = with_substeps(Cart(), 4)
     assert not Dynamics(program, ROW).remembers
     assert Dynamics(with_effect(program, "first_order_hold", 1.0), ROW).remembers
+
+
+def test_a_run_and_a_file_that_have_it_are_read_again(tmp_path) -> None:
+    source = (Path(__file__).parents[2] / "models" / "pendulum.py").read_text()
+    (tmp_path / "pendulum.py").write_text(source)
+    program = with_substeps(load_program(tmp_path / "pendulum.py"), 4)
+    program = with_effect(program, "first_order_hold", 0.75)
+    Fit(program, "hand", known_start=False).save(tmp_path / "run")
+    again = Fit.load(tmp_path / "run").program
+    assert again.substeps == 4 and again.first_order_hold.item() == 0.75
+    write_program(program, tmp_path / "held.py")
+    assert load_program(tmp_path / "held.py").first_order_hold.item() == 0.75
