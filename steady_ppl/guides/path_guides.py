@@ -195,6 +195,7 @@ def true_paths(program: Program, data: Trajectories) -> Paths:
         effect = torch.stack([run(noise + channel)[0] - base for channel in channels], -1)[..., own, :]
         difference = wrap_angles(after - base, program.angle_indices)[..., own]
         change = (torch.linalg.pinv(effect) @ difference.unsqueeze(-1)).squeeze(-1)
+        change = torch.where(within.transitions.unsqueeze(-1), change, 0.0)  # behind a trajectory's end is nothing
         noise = noise + change
         if not bool((change.abs() > NOISE_TOLERANCE * (1 + noise.abs())).any()):
             break

@@ -257,8 +257,9 @@ def test_every_effect_of_a_group_is_in_the_catalogue_and_in_the_world(name):
         options = {"drag": 0.06} if effect == "wind" else {}
         planted = Planted(effect, (0.05,) * components, options)
         assert variant.name == effect
-        plain = simulate(replace(group.world, duration=1.0), 2, seed=8)
-        moved = simulate(replace(group.world, duration=1.0, effects=(planted,)), 2, seed=8)
+        seconds = 4.0 if effect == "backlash" else 1.0  # play is felt when a command turns back
+        plain = simulate(replace(group.world, duration=seconds), 2, seed=8)
+        moved = simulate(replace(group.world, duration=seconds, effects=(planted,)), 2, seed=8)
         assert not torch.equal(plain.measurements, moved.measurements)
 
 

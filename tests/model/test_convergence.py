@@ -45,9 +45,17 @@ PROGRAMS = (
 MORE: dict[str, dict[str, int]] = {
     "pendulum": {"linear_drag": 2, "quadratic_drag": 4, "stiffness": 8, "cubic_stiffness": 32},
     "hovercraft": {"linear_drag": 2, "quadratic_drag": 4, "yaw_quadratic_drag": 2, "side_slip": 2}
-    | {"wind": 4, "magnus": 4, "weathervane": 32},
+    | {"wind": 4, "magnus": 4, "weathervane": 32, "added_mass": 2, "caster": 8},
     "gps_boat": {"linear_drag": 4, "quadratic_drag": 8, "yaw_quadratic_drag": 4, "side_slip": 4, "sticky_patch": 2}
-    | {"coulomb_friction": 2, "wind": 16, "magnus": 32, "weathervane": 32},
+    | {
+        "coulomb_friction": 2,
+        "wind": 16,
+        "magnus": 32,
+        "weathervane": 32,
+        "added_mass": 8,
+        "cross_flow": 8,
+        "caster": 32,
+    },
     "truck": {},
     "discovered_truck": {"actuator_lag": 2},
     "unicycle": {"yaw_quadratic_drag": 2, "response_time": 4, "curvature_steering": 2, "lever_arm": 4}
