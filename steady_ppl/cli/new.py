@@ -400,7 +400,7 @@ def _require_table_out(header: "Header", out: Path | None, renamed: Mapping[str,
         raise UsageError(f"{header.path}: {', and '.join(wrong)}: {how}")
 
 
-def _read(parts: Parts, header: "Header") -> st.Trajectories:
+def _read(parts: Parts, header: "Header") -> "st.Trajectories":
     """The table as the model reads it, checked; list what its units are taken to be."""
     from steady_ppl.runs.table_header import Column
     from steady_ppl.runs.vehicle_parts import columns_of
