@@ -1,4 +1,4 @@
-"""Vehicles on wheels that move in continuous time and are told otherwise than by a turn rate: a car, a robot.
+"""Vehicles on wheels that move in continuous time and are commanded otherwise than by a turn rate: a car, a robot.
 
 They are `continuous_worlds.Unicycle` with other commands; the car's sensors are those of `models/car.py`.
 """
@@ -24,7 +24,7 @@ class ToldOtherwise(Unicycle):
 
 @dataclass(frozen=True)
 class Car(ToldOtherwise):
-    """A kinematic bicycle that is told a speed and a steering angle: ω → v tan(steering) / wheelbase.
+    """A kinematic bicycle commanded by a speed and a steering angle: ω → v tan(steering) / wheelbase.
 
     The rear axle does not slip; an antenna ahead of it measures where it is.
 

@@ -1,4 +1,4 @@
-"""A car that is told a speed and a steering angle, with a GPS antenna and a gyroscope: list your own sensors."""
+"""A car commanded by a speed and a steering angle, with a GPS antenna and a gyroscope: list your own sensors."""
 
 import pyro
 import pyro.distributions as dist

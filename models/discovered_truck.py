@@ -15,7 +15,7 @@ from .truck import Truck
 class DiscoveredTruck(Truck):
     """The hand-written truck, and:
 
-    speed, turn as commanded `delay` seconds before                     it acts later than it is told
+    speed, turn as commanded `delay` seconds before                     it acts later than commanded
     turned    = (1 − share) turn + share · turn / speed · v              it steers a curve, not a turn rate
     a_forward = clip((speed_gain · speed − v) / speed_time, ±limit) + bias − w · yaw_rate
                                                                          it follows its command with a lag

@@ -1,4 +1,4 @@
-"""A robot that is told a speed and a turn rate: the file to copy for differential drives; list your own sensors."""
+"""A robot commanded by a speed and a turn rate: the file to copy for differential drives; list your own sensors."""
 
 import pyro
 import pyro.distributions as dist

@@ -18,6 +18,16 @@ from steady_ppl import Trajectories, load_program, seeded, simulate, stack
 from steady_ppl.model.program import Program, for_program
 
 MODELS = Path(__file__).parent.parent / "models"
+VEHICLES = (
+    "car",
+    "differential_drive",
+    "dynamic_bicycle",
+    "thruster_boat",
+    "ship",
+    "motor_joint",
+    "planar_quadrotor",
+    "tumbling_body",
+)  # of several kinds, in `models/`
 
 
 def example(name: str, dtype: torch.dtype = torch.float64) -> Program:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import torch
-from examples import example
+from examples import VEHICLES, example
 
 from steady_ppl import seeded
 from steady_ppl.model.handlers import draw_starts
@@ -22,14 +22,7 @@ EXAMPLES = [
     "neural_vehicle.py:NeuralHovercraft",
     "neural_vehicle.py:NeuralTruck",
     "neural_vehicle.py:AuthorsHovercraft",
-    "car",
-    "differential_drive",
-    "dynamic_bicycle",
-    "thruster_boat",
-    "ship",
-    "motor_joint",
-    "planar_quadrotor",
-    "tumbling_body",
+    *VEHICLES,
 ]
 
 

@@ -134,7 +134,7 @@ def px4(
 
 
 def ardupilot(world: World, *, seed: int = 0, noise: Numbers = (0, 0, 0)) -> bytes:
-    """A DataFlash log of a rover that is told a speed and a turn rate; its outputs are those of `px4`."""
+    """A DataFlash log of a rover commanded by a speed and a turn rate; its outputs are those of `px4`."""
     dice = np.random.default_rng(seed)
     gps, quick, driven = every(0.1, world), every(0.05, world), every(0.02, world)
     latitude, longitude = geodetic(_noisy(world.x[gps], noise[0], dice), _noisy(world.y[gps], noise[0], dice))

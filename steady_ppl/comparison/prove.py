@@ -188,19 +188,21 @@ def _require(programs: Mapping[str, Program], reference: str, truth: str | None,
 
 
 def _different_starts(judged: Mapping[str, Judged]) -> list[str]:
-    """Say where the first measurements tell the programs different priors of the start."""
-    problems = {name: one.problem for name, one in judged.items()}
-    centres = {
-        name: torch.cat(centre_of_start(one.program, one.data)).nan_to_num(torch.inf) if one.program.start else None
-        for name, one in problems.items()
-        if not one.known_start
-    }
-    (first, own), *others = list(centres.items()) or [("", None)]
+    """Say where the first measurements give the programs different priors of the start."""
+    centres = {name: _centre(one.problem) for name, one in judged.items()}
+    first, *others = centres
     return [
         f"{name} and {first} have different priors of the start: a part of their log p(y) is that"
-        for name, centre in others
-        if not (own is centre is None or (own is not None and centre is not None and torch.equal(own, centre)))
+        for name in others
+        if not torch.equal(centres[name], centres[first])
     ]
+
+
+def _centre(problem: Problem) -> Tensor:
+    """Where the first measurements centre the prior of the start, and how far they widen it; empty if they do not."""
+    if problem.known_start or not problem.program.start:
+        return torch.empty(0)
+    return torch.cat(centre_of_start(problem.program, problem.data)).nan_to_num(torch.inf)
 
 
 def _few_rows(data: Trajectories, horizons: Mapping[str, int], known_start: bool) -> list[str]:

@@ -184,7 +184,7 @@ class PlanarVehicle(Program):
         for sensor, its in listed:
             for name, values in sensor.tells(its).items():
                 found.setdefault(name, (values, torch.zeros_like(values)))
-        listed_cells = torch.zeros_like(data.observed)  # what these tell is told; their names say nothing more
+        listed_cells = torch.zeros_like(data.observed)  # their sensors speak for these, not their names
         for at in columns.values():
             listed_cells[..., list(at)] = data.observed[..., list(at)]
         by_name = super().told(data.without(listed_cells))

@@ -10,7 +10,7 @@ from itertools import pairwise
 
 import pytest
 import torch
-from examples import MODELS, each_effect_once_slow, example
+from examples import MODELS, VEHICLES, each_effect_once_slow, example
 
 from steady_ppl import for_program, seeded, simulate, with_substeps
 from steady_ppl.effects import catalogue, chosen_variant
@@ -32,14 +32,7 @@ PROGRAMS = (
     "neural_vehicle:NeuralTruck",
     "hovercraft_unknown_map",
     "unicycle",
-    "car",
-    "differential_drive",
-    "dynamic_bicycle",
-    "thruster_boat",
-    "ship",
-    "motor_joint",
-    "planar_quadrotor",
-    "tumbling_body",
+    *VEHICLES,
 )
 # times a program's substeps that an effect of typical size takes: its force is that at a step's beginning
 MORE: dict[str, dict[str, int]] = {

@@ -8,7 +8,7 @@ import pyro
 import pyro.distributions as dist
 import pytest
 import torch
-from examples import drives, example
+from examples import VEHICLES, drives, example
 from oracles import START_MEAN, START_SD, Stored, all_at_once, step_by_step
 from pyro import poutine
 from pyro.infer import Trace_ELBO
@@ -23,14 +23,7 @@ PROGRAMS = (
     "neural_vehicle:NeuralHovercraft",
     "neural_vehicle:NeuralTruck",
     "pendulum",
-    "car",
-    "differential_drive",
-    "dynamic_bicycle",
-    "thruster_boat",
-    "ship",
-    "motor_joint",
-    "planar_quadrotor",
-    "tumbling_body",
+    *VEHICLES,
 )
 
 

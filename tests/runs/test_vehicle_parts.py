@@ -27,7 +27,7 @@ MAP = ((0.0, 0.0), (6.0, 0.0), (6.0, 10.0))
 def test_vehicles_are_the_files_that_list_sensors() -> None:
     found = vehicles()
     assert {"car", "unicycle"} <= found.keys() and "gps_boat" not in found and "pendulum" not in found
-    assert found["car"].about == "A car that is told a speed and a steering angle"
+    assert found["car"].about == "A car commanded by a speed and a steering angle"
 
 
 @pytest.mark.parametrize("kind", sorted(vehicles()))
@@ -49,7 +49,7 @@ def test_every_vehicle_carries_every_sensor(kind: str, sensor: str, tmp_path: Pa
 
 
 def test_a_control_without_a_role_is_given_none(tmp_path: Path) -> None:
-    """Its vehicle is somebody's own: what it is told is no role, or in another unit than the role has."""
+    """The vehicle is a user's own: a control has no role, or another unit than the role."""
     text = (MODELS / "car.py").read_text().replace('"speed [m/s]", "steering [rad]"', '"speed [V]", "valve"')
     (tmp_path / "car.py").write_text(text)
     own = Vehicle("car", tmp_path / "car.py")

@@ -94,7 +94,7 @@ def gain_error(self: Program, control: Tensor, time: Tensor, c: Tensor, controls
     r"""u → (1 + c) u of one control, or of two wheels
 
     equation: u \to (1 + c)\,u
-    feels: does more (or less) than it is told
+    feels: does more (or less) than commanded
     occurs: a motor constant taken from the data sheet, a gear ratio or a wheel radius that is off
     """
     return control * (1 + c * self.chosen_controls(controls, control))

@@ -94,7 +94,7 @@ def curvature_steering(self: Program, state: Tensor, control: Tensor, time: Tens
     r"""turn → (1 - c) turn + c (turn / speed) v, none below a speed of knee
 
     equation: u_\mathrm{turn} \to (1 - c)\,u_\mathrm{turn} + c\,u_\mathrm{turn}\,v / u_\mathrm{speed}
-    feels: steers a curve, not a turn rate: turns slower while it is slower than it is told
+    feels: steers a curve, not a turn rate: turns slower while it is slower than commanded
     occurs: cars and trucks: the command is a steering angle, which fixes a curve and not a turn rate
     """
     speed, turn = (control[..., self.control_index(name)] for name in controls_of(self, "speed", "turn"))
@@ -223,7 +223,7 @@ def wheel_radius_difference(self: Program, control: Tensor, time: Tensor, c: Ten
     r"""right wheel → (1 + c/2) right, left wheel → (1 - c/2) left
 
     equation: u_\mathrm{right} \to (1 + c / 2)\,u_\mathrm{right},\quad u_\mathrm{left} \to (1 - c / 2)\,u_\mathrm{left}
-    feels: drives a wide curve when both wheels are told the same
+    feels: drives a wide curve when both wheels have the same command
     occurs: a worn tyre, a load on one side (unequal wheel diameters, Borenstein and Feng 1996)
     """
     left, right = (self.chosen_controls((name,), control) for name in _wheels(self))
@@ -235,7 +235,7 @@ def track_width(self: Program, control: Tensor, time: Tensor, c: Tensor) -> Tens
     r"""right wheel - left wheel → (1 + c) (right - left), their mean as it is: the track is 1 + c times narrower
 
     equation: u_\mathrm{right} - u_\mathrm{left} \to (1 + c)\,(u_\mathrm{right} - u_\mathrm{left})
-    feels: turns more (or less) than it is told, as straight and as fast as before
+    feels: turns more (or less) than commanded, as straight and as fast as before
     occurs: wide or soft tyres and tracks, which touch the ground elsewhere than in the middle (uncertainty about the
         wheelbase, Borenstein and Feng 1996)
     """
