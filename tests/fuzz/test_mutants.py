@@ -1,6 +1,6 @@
 """A good file is spoiled, and every command that takes it: done, or a line that says why not, and nothing left behind.
 
-pytest tests/fuzz                                             a few mutants of every table, through quick commands
+pytest tests/fuzz -m slow                                     a few mutants of every file, through quick commands
 pytest tests/fuzz -m "slow or exhaustive"                     every change of every file, through a command each
 pytest tests/fuzz -m "slow or not slow" --hypothesis-profile long       200 of each, others each time
 """
@@ -23,7 +23,6 @@ from text_mutants import DEFINITION, TOML, spellings
 from trying import is_long, tried
 
 Words = tuple[str, ...]
-TABLES = ("t.csv", "h.csv")
 LONG = settings.get_current_profile_name() == "long"
 CUT = {name: BYTES[name] for name in ("cut short", "a block lost", "a block twice", "empty", "a pipe", "junk")}
 
@@ -198,11 +197,8 @@ ONCE = [
 ]
 
 
-@pytest.mark.parametrize(
-    "kind",
-    [pytest.param(kind, marks=() if kind.file in (*TABLES, "before/run.json") else pytest.mark.slow) for kind in QUICK],
-    ids=str,
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", QUICK, ids=str)
 @few(2)
 @given(data=st.data())
 def test_a_spoiled_file_is_read_or_refused_in_a_line(desk: Desk, kind: Kind, data: st.DataObject) -> None:

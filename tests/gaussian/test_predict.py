@@ -81,8 +81,14 @@ def test_bearings_live_on_a_circle_and_positions_do_not(cart, even):
     assert on_a_circle(cart, even, even.states).tolist() == [False]
 
 
-@pytest.mark.parametrize("drives_of_set", [1, 3])
-@pytest.mark.parametrize("substeps", [1, 4])
+@pytest.mark.parametrize(
+    ("substeps", "drives_of_set"),
+    [
+        (1, 3),
+        pytest.param(1, 1, marks=pytest.mark.slow),
+        *(pytest.param(4, of, marks=pytest.mark.slow) for of in (1, 3)),
+    ],
+)
 def test_sets_of_several_programs_are_each_ones_own(substeps: int, drives_of_set: int) -> None:
     """The second program's are by kernels as well, and move as its numbers say."""
     hovercraft = with_substeps(example("hovercraft", torch.float32), substeps).requires_grad_(False)

@@ -325,6 +325,7 @@ def test_padding_that_blows_up_does_not_spoil_the_parameters():
 # --- learning ---------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_steady_learns_the_maximum_likelihood_estimate_of_the_cart():
     program, data, top = slow_cart()
     guide = SMCGuide(program, particles=200, draws=20, tempering=Constant())
