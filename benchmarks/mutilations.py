@@ -4,7 +4,8 @@
 
 Short drives of the demo's hovercraft and of the boat are spoiled in one to three ways that a log may be: jumps,
 dropouts, swapped columns, sensors that saturate or freeze, and so on. Each table is written and read again, as the
-command does. Resumable. Exits with 1 where one case ends with a traceback or not within its time.
+command does. Four of five searches are interrupted after some seconds, as `--minutes` does. Resumable. Exits with 1
+where one case ends with a traceback or not within its time.
 """
 
 from __future__ import annotations
@@ -44,10 +45,12 @@ ALL_SHARE, CURVES_SHARE = 0.1, 0.3  # of cases that look for every effect, and o
 FEW = 5  # effects that the others look for
 MAX_WAYS = 3  # in which one table is spoiled
 SECONDS = 600  # that one case may take, where nothing else is said
+INTERRUPTED_SHARE, INTERRUPT = 0.8, 10.0  # of cases that Ctrl-C ends after so many seconds of processor time
 TABLES = {
     "demo": ("hovercraft.py", "HovercraftTruth", 1, True),
     "boat": ("gps_boat.py", "GpsBoatTruth", 3, False),
 }  # program, truth, seed of its drives, whether their start is known
+WALL, PROCESSOR = (signal.ITIMER_REAL, signal.SIGALRM), (signal.ITIMER_VIRTUAL, signal.SIGVTALRM)
 OUTCOMES = ("verdict", "line", "traceback", "time")
 Way = Callable[[Trajectories, np.random.Generator], Trajectories]
 WAYS: dict[str, Way] = {}
@@ -317,19 +320,20 @@ def searched_for(program: Program, random: np.random.Generator) -> dict[str, lis
 
 
 @contextlib.contextmanager
-def within(seconds: float) -> Iterator[None]:
-    """Raise TimeIsUp in the block when so many seconds have gone by."""
+def within(seconds: float, of: tuple[int, int], raised: type[BaseException]) -> Iterator[None]:
+    """Raise an exception in the block when a timer (and its signal) has counted these seconds; never if infinite."""
 
     def end(*_: object) -> None:
-        raise TimeIsUp
+        raise raised
 
-    before = signal.signal(signal.SIGALRM, end)
-    signal.setitimer(signal.ITIMER_REAL, seconds)
+    timer, number = of
+    before = signal.signal(number, end)
+    signal.setitimer(timer, seconds if math.isfinite(seconds) else 0)
     try:
         yield
     finally:
-        signal.setitimer(signal.ITIMER_REAL, 0)
-        signal.signal(signal.SIGALRM, before)
+        signal.setitimer(timer, 0)
+        signal.signal(number, before)
 
 
 def work(table: str, case: int, seed: int, most: float = SECONDS) -> Record:
@@ -339,12 +343,13 @@ def work(table: str, case: int, seed: int, most: float = SECONDS) -> Record:
     path, _, _, known_start = TABLES[table]
     program = load_program(ROOT / "models" / path)
     sought = searched_for(program, random)
-    record: Record = {"table": table, "ways": chosen, **sought}
+    interrupt = INTERRUPT if random.random() < INTERRUPTED_SHARE else math.inf
+    record: Record = {"table": table, "ways": chosen, **sought, "interrupted": math.isfinite(interrupt)}
     began = time.perf_counter()
     with warnings.catch_warnings(record=True) as warned, tempfile.TemporaryDirectory() as folder:
         warnings.simplefilter("always")
         try:
-            with within(most):
+            with within(most, WALL, TimeIsUp), within(interrupt, PROCESSOR, KeyboardInterrupt):
                 write_table(data, Path(folder) / "drives.csv")
                 drives = read_table(Path(folder) / "drives.csv")
                 found = discover(program, drives, known_start=known_start, simulations=SIMULATIONS, **sought)
@@ -353,6 +358,8 @@ def work(table: str, case: int, seed: int, most: float = SECONDS) -> Record:
                 said["notes"] = [*found.doubts, *found.notes]
         except SteadyError as error:
             said = {"outcome": "line", "said": str(error).replace(folder, "…")}
+        except KeyboardInterrupt as stop:
+            said = {"outcome": "line", "said": f"interrupted: {stop}"}
         except TimeIsUp:
             said = {"outcome": "time", "said": f"more than {most:.0f} s", "where": traceback.format_exc()}
         except Exception as error:
