@@ -12,7 +12,9 @@ from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
-from steady_ppl.criticism.step_size import StepCheck, check_step
+import torch
+
+from steady_ppl.criticism.step_size import MIN_GAIN, StepCheck, check_step
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.discovery.candidates import (
     MAX_NATS_OF_RIVAL,
@@ -42,6 +44,7 @@ from steady_ppl.discovery.refits import (
 from steady_ppl.discovery.screening import Tested
 from steady_ppl.discovery.search_state import FINER, LOOKING, MAX_EFFECTS, Found, Round, Search, with_places_of
 from steady_ppl.effects import Effect, Variant, attached
+from steady_ppl.errors import FilterError
 from steady_ppl.model.problem import Problem
 from steady_ppl.model.program import Program
 from steady_ppl.model.substeps import with_substeps
@@ -96,6 +99,7 @@ def search(problem: Problem, valid: Trajectories, settings: Settings) -> Search:
         left, valid = (one.left for one in outliers)
         (base, corrections), tails = suited, suited.tails
         gained = whole.maxima[0].gained
+        _require_resolved(base)
         begin()
         step = _step_of(base)
         if step.too_coarse:  # the step is no effect: what follows is about the program at the step that suits
@@ -130,6 +134,20 @@ def search(problem: Problem, valid: Trajectories, settings: Settings) -> Search:
             return found
     found.notes.append(COARSE.format(finer))
     return found
+
+
+def _require_resolved(base: Refit) -> None:
+    """Raise FilterError where rounding moves a trajectory's log p(y) by more than what counts between programs."""
+    precision = torch.finfo(next(base.program.parameters()).dtype).eps
+    for fold, maximum in zip(base.folds, base.maxima, strict=True):
+        likely, index = maximum.log_likelihood.min(0)
+        if -likely * precision > MIN_GAIN:
+            label = fold.drives.labels[int(index)]
+            raise FilterError(
+                f"trajectory {label}: its log p(y) is {float(likely):.2g} nats, too far down to compare programs: "
+                "`steady doctor` looks for wrong readings and units",
+                trajectory=label,
+            )
 
 
 def _step_of(refit: Refit, **watched: Any) -> StepCheck:

@@ -12,6 +12,7 @@ from steady_ppl.discovery.candidates import MAX_NATS_BEHIND, leaders
 from steady_ppl.discovery.noise_first import Suited
 from steady_ppl.discovery.refits import Refit
 from steady_ppl.discovery.search import Found
+from steady_ppl.errors import FilterError
 
 
 def test_a_class_begins_with_what_was_chosen():
@@ -436,3 +437,18 @@ def test_without_tests_of_what_was_carried_the_search_at_a_finer_step_fails(monk
     else:
         search._add_all(found, search.Settings(declared=None), carried)
         assert found.taken_back == {"drag": "RuntimeError: the tide is out"} and found.final == "base"
+
+
+def test_programs_are_not_compared_where_rounding_moves_log_p_by_more_than_what_counts():
+    drives = SimpleNamespace(labels=("early", "late"))
+
+    def base(likely, dtype):
+        program = SimpleNamespace(parameters=lambda: iter([torch.zeros(1, dtype=dtype)]))
+        maximum = SimpleNamespace(log_likelihood=torch.tensor([-10.0, likely]))
+        return SimpleNamespace(program=program, folds=[SimpleNamespace(drives=drives)], maxima=[maximum])
+
+    with pytest.raises(FilterError, match=r"trajectory late: its log p\(y\) is -3e\+07 nats") as raised:
+        search._require_resolved(base(-3e7, torch.float32))
+    assert raised.value.trajectory == "late"
+    search._require_resolved(base(-2e7, torch.float32))
+    search._require_resolved(base(-3e7, torch.float64))
