@@ -138,10 +138,9 @@ def search(problem: Problem, valid: Trajectories, settings: Settings) -> Search:
 
 def _require_resolved(base: Refit) -> None:
     """Raise FilterError where rounding moves a trajectory's log p(y) by more than what counts between programs."""
-    precision = torch.finfo(next(base.program.parameters()).dtype).eps
     for fold, maximum in zip(base.folds, base.maxima, strict=True):
         likely, index = maximum.log_likelihood.min(0)
-        if -likely * precision > MIN_GAIN:
+        if -likely * torch.finfo(fold.drives.measurements.dtype).eps > MIN_GAIN:
             label = fold.drives.labels[int(index)]
             raise FilterError(
                 f"trajectory {label}: its log p(y) is {float(likely):.2g} nats, too far down to compare programs: "

@@ -244,6 +244,7 @@ def quiet_round():
 def asking(monkeypatch):
     """A search that has found a drag, beside which its step is too coarse, and how to say what its rounds come to."""
     base = SimpleNamespace(maxima=[SimpleNamespace(gained=0.0)], program=None)
+    monkeypatch.setattr(search, "_require_resolved", lambda base: None)
     cleaned = (base, Suited(base, []), 2 * [SimpleNamespace(left=None)], base)
     monkeypatch.setattr(search, "without_outliers", lambda *_: cleaned)
     monkeypatch.setattr(search, "with_suitable_noise", lambda base, wanted, tails: Suited(base, []))
@@ -440,12 +441,10 @@ def test_without_tests_of_what_was_carried_the_search_at_a_finer_step_fails(monk
 
 
 def test_programs_are_not_compared_where_rounding_moves_log_p_by_more_than_what_counts():
-    drives = SimpleNamespace(labels=("early", "late"))
-
     def base(likely, dtype):
-        program = SimpleNamespace(parameters=lambda: iter([torch.zeros(1, dtype=dtype)]))
+        drives = SimpleNamespace(labels=("early", "late"), measurements=torch.zeros(1, dtype=dtype))
         maximum = SimpleNamespace(log_likelihood=torch.tensor([-10.0, likely]))
-        return SimpleNamespace(program=program, folds=[SimpleNamespace(drives=drives)], maxima=[maximum])
+        return SimpleNamespace(folds=[SimpleNamespace(drives=drives)], maxima=[maximum])
 
     with pytest.raises(FilterError, match=r"trajectory late: its log p\(y\) is -3e\+07 nats") as raised:
         search._require_resolved(base(-3e7, torch.float32))
