@@ -16,7 +16,7 @@ import os
 import re
 import sys
 import tempfile
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -245,10 +245,11 @@ def _without_progress(text: str, out: str) -> str:
     return " ".join(PROGRESS.sub("", text.replace(f"{out}/", "")).split())
 
 
-def page(records: Sequence[Record]) -> str:
-    """The table."""
-    lines = ["# Other people's data", "", "| case | asked for | found | met | CPU s |", "|---|---|---|---|---|"]
-    for record in sorted(records, key=lambda record: list(CASES).index(record["set"])):
+def page(records: Sequence[Record], title: str, cases: Iterable[str]) -> str:
+    """The table, in the order of cases."""
+    order = list(cases)
+    lines = [f"# {title}", "", "| case | asked for | found | met | CPU s |", "|---|---|---|---|---|"]
+    for record in sorted(records, key=lambda record: order.index(record["set"])):
         spent = f"{sum(step['cpu'] for step in record.get('cost', {}).values()):.0f}"
         for one in record.get("asked") or [Asked("a record", record.get("failed", ""), False)._asdict()]:
             value, met = one["value"].replace("|", "/"), "yes" if one["is_met"] else "**no**"
@@ -273,9 +274,10 @@ def main() -> int:
     sources = [file for place in ("steady_ppl", "inference") for file in (ROOT / place).rglob("*.py")]
     version = f"{digest(files=[Path(__file__), *sources])} {given.simulations or 'own'} sets"
     records = run(work, jobs, given.results, version=version, workers=given.workers)
-    print(page(records))
+    text = page(records, "Other people's data", CASES)
+    print(text)
     if given.results == RESULT and set(given.only) == set(CASES):
-        RESULT.with_suffix(".md").write_text(page(records))
+        RESULT.with_suffix(".md").write_text(text)
     return int(not all(one["is_met"] for record in records for one in record.get("asked") or [{"is_met": False}]))
 
 

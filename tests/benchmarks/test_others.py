@@ -101,7 +101,8 @@ def test_commands_run_in_the_folder_of_a_case_and_one_that_fails_is_no_answer(tm
     assert [one["is_met"] for one in record["asked"]] == [True, True, False]
     assert "'never'" in record["asked"][-1]["value"]
     assert set(record["cost"]) == {"fit"} and record["cost"]["fit"]["peak"] > 50
-    assert "| cart | an answer |" in others.page([record]) and "| **no** |" in others.page([record])
+    assert "| cart | an answer |" in others.page([record], "Cases", others.CASES)
+    assert "| **no** |" in others.page([record], "Cases", others.CASES)
 
 
 def test_a_free_run_begins_where_the_first_rows_say_and_has_no_noise(tmp_path: Path) -> None:
