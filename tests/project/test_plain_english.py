@@ -20,7 +20,9 @@ NAMES = (
     "discovery-limits",
     "discovery-results",
     "discovery-verdict",
+    "guides",
     "limitations",
+    "results-guides",
     "results-paper",
     "results-speed",
 )
