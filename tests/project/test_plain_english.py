@@ -22,6 +22,7 @@ NAMES = (
     "discovery-verdict",
     "guides",
     "limitations",
+    "methods",
     "results-guides",
     "results-paper",
     "results-speed",
