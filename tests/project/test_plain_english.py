@@ -11,6 +11,7 @@ import pytest
 ROOT = Path(__file__).parents[2]
 README = ROOT / "README.md"
 NAMES = (
+    "architecture",
     "cli",
     "comparison",
     "demo",
