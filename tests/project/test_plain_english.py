@@ -23,6 +23,7 @@ NAMES = (
     "discovery-verdict",
     "guides",
     "limitations",
+    "mathematics",
     "methods",
     "results-guides",
     "results-paper",
