@@ -25,6 +25,7 @@ NAMES = (
     "limitations",
     "mathematics",
     "methods",
+    "promises",
     "results-guides",
     "results-paper",
     "results-speed",
