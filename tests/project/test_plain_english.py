@@ -29,6 +29,7 @@ NAMES = (
     "results-guides",
     "results-paper",
     "results-speed",
+    "truck",
 )
 PAGES = [README, *(ROOT / "docs" / f"{name}.md" for name in NAMES)]
 UNWANTED = re.compile(
