@@ -22,6 +22,7 @@ NAMES = (
     "discovery-results",
     "discovery-verdict",
     "guides",
+    "kernels",
     "limitations",
     "mathematics",
     "methods",
