@@ -40,7 +40,7 @@ from steady_ppl.utils.random import seeded
 MAX_LINEARISATION_ERROR = 0.5  # nats a drive by which the linearised log p(y) may be off
 MAX_NATS_BETWEEN_FILTERS = 1.0  # a drive: beyond it a filter has lost its particles, as at a jump of the GPS
 MIN_SHARE_OF_SURE_DRIVES = 0.5  # in which two filters agree; where they do in fewer, none can say
-GUIDE_PARTICLES, JUDGE_PARTICLES = 100, 400  # of the guide and of the judge: see docs/discovery.md, step 4
+GUIDE_PARTICLES, JUDGE_PARTICLES = 100, 400  # of the guide and of the judge: see docs/discovery-fits.md
 NOISE_FORMS = ("spread", "colour")  # of effects that are process noise
 PROBE_MOVE = 0.1  # by how much a number is moved
 SPREAD_TOLERANCE = 1e-3  # by which log spreads may change otherwise in one row than in another

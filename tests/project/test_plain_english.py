@@ -10,7 +10,28 @@ import pytest
 
 ROOT = Path(__file__).parents[2]
 README = ROOT / "README.md"
-NAMES = ("cli", "comparison", "demo", "discovery-results", "limitations", "results-paper", "results-speed")
+NAMES = (
+    "architecture",
+    "cli",
+    "comparison",
+    "demo",
+    "discovery",
+    "discovery-first",
+    "discovery-fits",
+    "discovery-limits",
+    "discovery-results",
+    "discovery-verdict",
+    "guides",
+    "kernels",
+    "limitations",
+    "mathematics",
+    "methods",
+    "promises",
+    "results-guides",
+    "results-paper",
+    "results-speed",
+    "truck",
+)
 PAGES = [README, *(ROOT / "docs" / f"{name}.md" for name in NAMES)]
 UNWANTED = re.compile(
     r"\b(believ\w*|accus\w*|innocent|swallow\w*|guilty|(?:model|program|particle|score)s? (?:explains?|knows?)"
