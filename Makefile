@@ -10,7 +10,7 @@ export OMP_NUM_THREADS ?= 1
 TORCH := $(shell sed -n 's/^\(torch==[^ ]*\).*/\1/p' requirements/torch.txt)
 PIP := $(BIN)/python -m pip --quiet --disable-pip-version-check
 
-.PHONY: demo test test-slow test-share test-all calibrate learn learn-truck truck paper lint types check wheel docs lock audit clean
+.PHONY: demo test test-slow test-share test-all calibrate learn learn-truck truck real paper lint types check wheel docs lock audit clean
 
 # Every package is checked by its hash, and none is built but this one. torch is fetched first, for pip would pass over a
 # CPU build that an index offers without saying its hash, and not at all where a build of its version is installed. The
@@ -39,6 +39,10 @@ learn-truck: $(INSTALLED)
 truck: $(INSTALLED)
 	@test -n "$(DATA)" || { echo "make truck DATA=FOLDER: the folder with train/, valid/ and test/ of the AlphaTruck logs" >&2; exit 2; }
 	$(BIN)/python benchmarks/truck.py --data "$(DATA)" --draws $(DRAWS) --out $(OUT)/truck
+
+real: $(INSTALLED)
+	@test -n "$(DATA)" || { echo "make real DATA=FOLDER: the folder with victoria_park/ and mrclam/" >&2; exit 2; }
+	$(BIN)/python benchmarks/real.py --cases "$(DATA)" --results $(OUT)/real.jsonl
 
 paper: $(INSTALLED)
 	$(BIN)/python benchmarks/paper.py --out $(OUT)/paper $(if $(DATA),--data "$(DATA)") $(if $(QUICK),--quick)

@@ -58,6 +58,7 @@ CAPTURED = {
 }
 NEAR = 0.25  # of which a figure may be off, with the right sign
 MAX_AWAY, MAX_MAP = 0.1, 0.15  # m
+RANGE_SD = 0.09  # m, as declared
 WRONG_BY = 1.0  # m, of every landmark where they are unknown
 EFFECTS = {
     "turn response, s": "response_time:yaw",
@@ -79,7 +80,7 @@ class VictoriaPark(Car):
 class Robot(Unicycle):
     """A robot among barcodes, whose places `landmarks_of` reads."""
 
-    sensors = (Ranges(sd=0.09), Bearings(sd=0.03))
+    sensors = (Ranges(sd=RANGE_SD), Bearings(sd=0.03))
     duration = 20.0
 
     def initial(self) -> Tensor:
@@ -125,19 +126,19 @@ def car(cases: Path) -> Iterator[Asked]:
     train, *_ = drives(cases, "victoria_park")
     program = fitted(VictoriaPark(), train).program
     yield within("antenna ahead of the rear axle", program.antenna[0].item(), ANTENNA, "m")
-    yield within("wheelbase", float(program.wheelbase), WHEELBASE, "m")
-    yield within("steering offset", float(program.steering_offset), STEERING, "rad")
+    yield within("wheelbase", program.wheelbase.item(), WHEELBASE, "m")
+    yield within("steering offset", program.steering_offset.item(), STEERING, "rad")
 
 
 def captured(program: Robot, sizes: dict[str, float]) -> dict[str, float]:
     """The figures of `CAPTURED` by a program, as far as it has them; `sizes` are those of its effects."""
-    found = {"speed gain": float(program.speed_gain), "turn gain": float(program.turn_gain)}
+    found = {"speed gain": program.speed_gain.item(), "turn gain": program.turn_gain.item()}
     found |= {name: sizes[effect] for name, effect in EFFECTS.items() if effect in sizes}
     if (response := "turn response, s") in found:
         found[response] += program.settling
     if (spread := "sd of a range at 6 m, m") in found:
         wider = sizes.get("measurement_noise:range", sizes.get("measurement_noise", 1.0))
-        found[spread] = program.sensors[0].sd * wider * (1 + 6.0 * found[spread])
+        found[spread] = RANGE_SD * wider * (1 + 6.0 * found[spread])
     return found
 
 
@@ -148,17 +149,17 @@ def is_near(name: str, value: float) -> bool:
 def robot_estimated(cases: Path) -> Iterator[Asked]:
     train, _, test = drives(cases, "mrclam")
     program = fitted(robot(KnownRobot, cases), train).program
-    values = {name.replace("_range", ":range").replace("_yaw", ":yaw"): value for name, value in _sizes(program)}
-    for name, value in captured(program, values).items():
+    for name, value in captured(program, sizes_of(program)).items():
         yield Asked(f"{name}, motion capture {CAPTURED[name]:g}", f"{value:.4g}", is_near(name, value))
     away = locations_off(program, test)
     told = f"{float(away.median()):.3f} m, at most {float(away.max()):.3f}"
     yield Asked(f"location, median per trajectory ≤ {MAX_AWAY:g} m", told, float(away.median()) <= MAX_AWAY)
 
 
-def _sizes(program: Robot) -> Iterator[tuple[str, float]]:
-    names = [text.partition("=")[0].replace(":", "_") for text in KnownRobot.effects]
-    return ((name, float(getattr(program, name))) for name in names)
+def sizes_of(program: Robot) -> dict[str, float]:
+    """The effects of `KnownRobot` as they are in a program."""
+    names = [text.partition("=")[0] for text in KnownRobot.effects]
+    return {name: getattr(program, name.replace(":", "_")).item() for name in names}
 
 
 def locations_off(program: Robot, test: Trajectories) -> Tensor:
