@@ -27,6 +27,7 @@ NAMES = (
     "mathematics",
     "methods",
     "promises",
+    "real-logs",
     "results-guides",
     "results-paper",
     "results-speed",
