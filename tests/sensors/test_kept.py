@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 import math
+from itertools import product
 
 import numpy as np
 import pyro
 import pyro.distributions as dist
 import pytest
 import torch
-from examples import drives, example
+from examples import VEHICLES as VEHICLES_OF_MODELS, drives, example
 from kernel_programs import assert_same, both
 from oracles import all_at_once, step_by_step
 from torch import tensor
 
 import steady_ppl as st
+from steady_ppl import sensors
 from steady_ppl.comparison.evaluate import forward
 from steady_ppl.effects import chosen_variant
 from steady_ppl.gaussian.linearize import ReferencePath, linearize
@@ -26,7 +28,19 @@ from steady_ppl.model.handlers import Recording, running
 from steady_ppl.model.problem import Problem
 from steady_ppl.model.substeps import mean_step, noisy_step
 from steady_ppl.model.validate import probe
-from steady_ppl.sensors import Accelerometer, BodyVelocity, Encoder, Heading, Pose, RangesBearings, WheelSpeed
+from steady_ppl.sensors import (
+    Accelerometer,
+    Bearings,
+    BodyVelocity,
+    Encoder,
+    Heading,
+    Pose,
+    Position,
+    Ranges,
+    RangesBearings,
+    WheelSpeed,
+    YawRate,
+)
 from steady_ppl.smc.simulate import simulated_substeps
 
 SENSORS = (
@@ -38,6 +52,20 @@ SENSORS = (
 )
 OF_LANDMARKS = (RangesBearings(sd=0.2, bearing_sd=0.05), *SENSORS)
 VEHICLES = {"unicycle": OF_LANDMARKS, "car": SENSORS, "hovercraft": OF_LANDMARKS}
+EVERY_SENSOR = (
+    *OF_LANDMARKS,
+    Ranges(sd=0.2, name="radio"),
+    Bearings(sd=0.05, name="camera"),
+    Position(sd=0.5, name="gps", offset=(0.4, -0.2)),
+    YawRate(sd=0.02, name="gyro"),
+    WheelSpeed(sd=0.1, name="right", left=-0.4, size=0.9),
+)
+LANDMARKS = ((5.0, 1.0), (-4.0, 6.0), (0.0, -7.0))
+PLANAR = (
+    "hovercraft",
+    "unicycle",
+    *(name for name in VEHICLES_OF_MODELS if isinstance(example(name), st.PlanarVehicle)),
+)
 
 
 def carrying(name: str, listed=None, dtype: torch.dtype = torch.float64, **more) -> st.Program:
@@ -53,10 +81,21 @@ def reading(program, state) -> torch.Tensor:
     return torch.cat([fn.base_dist.loc for fn in seen.distributions.values()], -1).detach()
 
 
-@pytest.mark.parametrize("name", VEHICLES)
-@pytest.mark.parametrize("substeps", [1, 3])
+def with_every_sensor(name: str, dtype: torch.dtype = torch.float64) -> st.Program:
+    return carrying(name, EVERY_SENSOR, dtype, landmarks=LANDMARKS)
+
+
+def test_every_sensor_is_carried():
+    every = {type(one) for one in EVERY_SENSOR}
+    assert every == {getattr(sensors, name) for name in sensors.__all__} - {sensors.Sensor, sensors.Several}
+
+
+@pytest.mark.parametrize(
+    ("name", "substeps"),
+    [pytest.param(*pair, marks=() if pair == ("car", 1) else pytest.mark.slow) for pair in product(PLANAR, (1, 3))],
+)
 def test_a_program_is_the_same_in_turn_at_once_and_by_kernels(name, substeps, monkeypatch):
-    program = st.with_substeps(carrying(name), substeps)
+    program = st.with_substeps(with_every_sensor(name), substeps)
     probe(program)
     kept = ("mean_forward", "mean_lateral", "mean_yaw", "mean_squared_yaw_rate", "travelled", "turned")
     assert program.state_names[6:] == program.resting_names == kept
@@ -81,7 +120,7 @@ def test_a_program_is_the_same_in_turn_at_once_and_by_kernels(name, substeps, mo
             expected = torch.where(data.transitions[..., None], (ends[0] - ends[1]) / 2e-5, 0.0)
             torch.testing.assert_close(slopes[..., index], expected, rtol=1e-5, atol=1e-6)
 
-    program = st.with_substeps(carrying(name, dtype=torch.float32), substeps)
+    program = st.with_substeps(with_every_sensor(name, torch.float32), substeps)
     data = st.for_program(program, data)
     path = ReferencePath(path.states.float(), path.noise.float())
     monkeypatch.setattr(rows_by_kernels, "ROWS_WORTH_COMPILING", 1)
