@@ -66,6 +66,7 @@ PLANAR = (
     "unicycle",
     *(name for name in VEHICLES_OF_MODELS if isinstance(example(name), st.PlanarVehicle)),
 )
+MARKS = {("car", 1): (), ("hovercraft", 3): pytest.mark.slow}  # of the others a share is run each day
 
 
 def carrying(name: str, listed=None, dtype: torch.dtype = torch.float64, **more) -> st.Program:
@@ -92,7 +93,7 @@ def test_every_sensor_is_carried():
 
 @pytest.mark.parametrize(
     ("name", "substeps"),
-    [pytest.param(*pair, marks=() if pair == ("car", 1) else pytest.mark.slow) for pair in product(PLANAR, (1, 3))],
+    [pytest.param(*pair, marks=MARKS.get(pair, pytest.mark.exhaustive)) for pair in product(PLANAR, (1, 3))],
 )
 def test_a_program_is_the_same_in_turn_at_once_and_by_kernels(name, substeps, monkeypatch):
     program = st.with_substeps(with_every_sensor(name), substeps)
