@@ -56,6 +56,11 @@ def _turning(of: Substep) -> Sequence[Tensor]:
     return _mean(of, of.accelerations[2], (first * first + first * last + last * last) / 3)
 
 
+def _direction(of: Substep) -> Sequence[Tensor]:
+    heading = of.before[..., 2] + 0.5 * of.turn
+    return _mean(of, heading.cos(), heading.sin())
+
+
 def _travelled(of: Substep) -> Sequence[Tensor]:
     speeds = (of.vehicle.body_velocity(state)[0] for state in (of.before, of.after))
     return (0.5 * sum(speeds) * of.step,)
@@ -72,6 +77,7 @@ def _mean(of: Substep, *values: Tensor) -> Sequence[Tensor]:
 QUANTITIES = {
     "acceleration": Quantity(lambda kind: ("mean_forward [m/s²]", "mean_lateral [m/s²]"), _acceleration),
     "turning": Quantity(lambda kind: ("mean_yaw [rad/s²]", "mean_squared_yaw_rate [rad²/s²]"), _turning),
+    "direction": Quantity(lambda kind: ("mean_cosine [1]", "mean_sine [1]"), _direction),
     "travelled": Quantity(lambda kind: ("travelled [m]",), _travelled),
     "turned": Quantity(lambda kind: ("turned [rad]",), lambda of: (of.turn,)),
     "control": Quantity(

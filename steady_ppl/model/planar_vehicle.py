@@ -137,8 +137,9 @@ class PlanarVehicle(Program):
         Args:
             state: `(..., D)`, as `observe` has it.
             quantity: acceleration: mean forward and lateral one, m/s²; turning: mean yaw acceleration, rad/s², and
-                squared yaw rate, rad²/s²; travelled: way ahead, m; turned: rad; control: the row's, as it acted;
-                before: x, y, heading, vx, vy and yaw_rate in the row before.
+                squared yaw rate, rad²/s²; direction: mean cosine and sine of the heading; travelled: way ahead, m;
+                turned: rad; control: the row's, as it acted; before: x, y, heading, vx, vy and yaw_rate in the row
+                before.
 
         Raises:
             ProgramError: the vehicle does not keep it.

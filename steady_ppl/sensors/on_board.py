@@ -127,22 +127,25 @@ class BodyVelocity(Sensor):
 class Accelerometer(Sensor):
     """Its specific force ahead and to its left, m/s², the mean over the row that ends with the reading.
 
-    A mean is what a logger keeps of a faster sensor, and does not depend on the program's time step. On level ground
-    specific force is acceleration; a slope or a heel of the vehicle adds gravity, which is no part of the reading.
+    A mean is what a logger keeps of a faster sensor, and does not depend on the program's time step. Specific force is
+    acceleration less that of free fall. On level ground these are one; a slope or a heel of the vehicle is left out.
 
     Attributes:
         offset: its place, m ahead of the tracked point and to its left.
         angle: rad that it is turned anticlockwise on its mount.
+        gravity: of free fall along x and y, m/s²; (0, -9.81) where the plane is upright and y points up.
     """
 
     offset: Setting | None = None
     angle: Setting = 0.0
+    gravity: Setting | None = None
 
     kind = "accelerometer"
 
     @property
     def keeps(self) -> tuple[str, ...]:
-        return ("acceleration",) if self.offset is None else ("acceleration", "turning")
+        more = {"turning": self.offset, "direction": self.gravity}
+        return "acceleration", *(name for name, what in more.items() if what is not None)
 
     def columns(self, program: Any) -> tuple[str, ...]:
         return f"{self.name}_forward [m/s²]", f"{self.name}_lateral [m/s²]"
@@ -153,6 +156,10 @@ class Accelerometer(Sensor):
             yaw, square = program.kept(state, "turning").unbind(-1)
             ahead, left = setting(program, self.offset, state).unbind(-1)
             forward, lateral = forward - yaw * left - square * ahead, lateral + yaw * ahead - square * left
+        if self.gravity is not None:
+            cosine, sine = program.kept(state, "direction").unbind(-1)
+            x, y = setting(program, self.gravity, state).unbind(-1)
+            forward, lateral = forward - cosine * x - sine * y, lateral + sine * x - cosine * y
         return on_mount(program, self.angle, forward, lateral)
 
 

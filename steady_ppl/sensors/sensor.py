@@ -37,6 +37,7 @@ _SETTINGS = {
     **dict.fromkeys(("sd", "heading_sd", "bearing_sd", "size"), (_is_positive, "a number above zero")),
     **dict.fromkeys(("angle", "left"), (_is_number, "a finite number")),
     "offset": (_is_place, "two numbers, m ahead and to the left"),
+    "gravity": (_is_place, "two numbers, m/s² along x and y"),
     "from_north": (lambda value: isinstance(value, bool), "True or False"),
 }
 

@@ -216,6 +216,21 @@ def test_what_is_read_is_that_of_a_world_in_steps_of_a_millisecond(substeps, clo
     assert abs(now - rolled[100::100]).max() < close * abs(rolled).max()
 
 
+def test_an_accelerometer_in_an_upright_plane_feels_what_holds_it_up_and_not_its_weight() -> None:
+    listed = (Accelerometer(sd=0.1, gravity=(0.0, -9.81)),)
+    quadrotor = st.with_substeps(carrying("planar_quadrotor", listed), 16)
+    probe(quadrotor)
+    state = torch.zeros(len(quadrotor.state_names)).double()
+    state[:6] = tensor([0.0, 0.0, 0.4, 1.0, -0.5, 2.0])
+    step, held = tensor(0.05).double(), tensor([2.5, 2.4]).double()
+    with torch.no_grad():
+        after = mean_step(quadrotor, state, held, tensor(0.0).double(), step)
+        forward, lateral = reading(quadrotor, after)
+        speeds = [float(quadrotor.body_velocity(one)[0]) for one in (state, after)]
+    assert float(lateral) == pytest.approx(4.9 / 0.5, abs=0.02)  # thrust alone; across the bar nothing drags
+    assert float(forward) == pytest.approx(-0.3 * sum(speeds) / 2, abs=0.02)
+
+
 def test_whatever_pushes_is_felt_and_other_states_lie_beside() -> None:
     plain = st.with_substeps(carrying("hovercraft", (Accelerometer(sd=0.1),)), 2)
     coloured = plain.with_effect("coloured_noise:translation", 0.5).with_effect("acceleration_bias", (0.3, -0.2))
@@ -398,6 +413,7 @@ def test_an_offset_and_a_delay_see_each_other(late: str, first: bool) -> None:
     ("make", "match"),
     [
         (lambda: Accelerometer(sd=0.1, offset=3.0), "offset is two numbers, m ahead and to the left, got 3.0"),
+        (lambda: Accelerometer(sd=0.1, gravity=9.81), "gravity is two numbers, m/s² along x and y, got 9.81"),
         (lambda: Accelerometer(sd=0.1, angle=(1.0, 2.0)), r"angle is a finite number, got \(1.0, 2.0\)"),
         (lambda: Encoder(sd=0.1, left=math.nan), "left is a finite number, got nan"),
         (lambda: Pose(sd=0.1, heading_sd=-1), "sensor pose: heading_sd is a number above zero, got -1"),
