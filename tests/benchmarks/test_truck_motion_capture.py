@@ -4,14 +4,21 @@ from __future__ import annotations
 
 import json
 import math
-from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
+from truck_capture_logs import as_rows, numbered, on_time, read_split
+from truck_capture_regressions import (
+    euler_from_continuous,
+    lateral,
+    lateral_by_euler,
+    lateral_by_instruments,
+    regression,
+)
+from truck_capture_responses import LATERAL_RESPONSES, SPEED_RESPONSES, TURN_RESPONSES, fitted, process_noise
 from truck_logs import stamped
-
-BENCHMARKS = Path(__file__).parents[2] / "benchmarks"
+from truck_motion_capture import main, markdown, values, with_interval, write
 
 TRUTH = {"lever": 0.38, "slip": -0.085, "crab": -0.013, "settling": 0.04}
 SPEED = {"gain": 0.91, "lag": 0.2, "delay": 0.1}
@@ -19,13 +26,6 @@ TURN = {"gain": 0.82, "lag": 0.08, "delay": 0.11, "share": 0.75, "caster": 1.2}
 NOISE = (0.6, 0.6, 1.2)  # m/s², m/s², rad/s², held for .1 s
 TICK = 0.001  # s, of the synthetic truck
 SECONDS = 120.0
-
-
-@pytest.fixture(scope="module")
-def capture():
-    import truck_motion_capture
-
-    return truck_motion_capture
 
 
 def commands(generator: np.random.Generator) -> np.ndarray:
@@ -86,8 +86,8 @@ def logs(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def segments(capture, logs):
-    return capture.numbered(capture.read_split(logs))
+def segments(logs):
+    return numbered(read_split(logs))
 
 
 def holds(fit, truth, *, within=()):
@@ -105,107 +105,107 @@ def test_a_gap_splits_the_log_and_blocks_stay_within_segments(segments):
     assert all(np.ptp(s.time[s.block == b]) < 12 for s in segments for b in np.unique(s.block))
 
 
-def test_late_messages_get_their_time_back_and_lost_frames_keep_theirs(capture):
+def test_late_messages_get_their_time_back_and_lost_frames_keep_theirs():
     regular = 0.01 * np.arange(400) + 0.01 * (np.arange(400) > 200)
     late = regular + 0.008 * (np.arange(400) % 7 == 3)
-    assert np.abs(capture.on_time(late) - regular).max() < 1e-9
+    assert np.abs(on_time(late) - regular).max() < 1e-9
 
 
 LAW = {name: TRUTH[name] for name in ("lever", "slip", "crab", "settling")}
 
 
-def test_lateral_response_is_found(capture, segments):
-    response = capture.LATERAL_RESPONSES["held: lever, slip, settling, crab"]
-    fit = capture.fitted(response, segments)
+def test_lateral_response_is_found(segments):
+    response = LATERAL_RESPONSES["held: lever, slip, settling, crab"]
+    fit = fitted(response, segments)
     holds(fit, LAW)
 
 
-def test_regression_finds_lever_and_slip_at_each_window(capture, logs):
+def test_regression_finds_lever_and_slip_at_each_window(logs):
     for window in (0.15, 0.41):
-        segments = capture.numbered(capture.read_split(logs, window=window))
-        fit = capture.lateral(segments, ("lever", "slip", "crab", "offset"))
+        segments = numbered(read_split(logs, window=window))
+        fit = lateral(segments, ("lever", "slip", "crab", "offset"))
         law = {name: TRUTH[name] for name in ("lever", "slip", "crab")} | {"offset": 0.0}
         holds(fit, law, within={"lever": 0.012, "slip": 0.005})  # it leaves out that the truck settles
 
 
-def test_instruments_agree_with_least_squares(capture, logs, segments):
-    odd, even = (capture.numbered(capture.read_split(logs, frames=slice(i, None, 2))) for i in (0, 1))
-    by_instruments = capture.lateral_by_instruments(odd, even, ("lever", "slip"))["parameters"]
-    plain = capture.lateral(segments, ("lever", "slip"))["parameters"]
+def test_instruments_agree_with_least_squares(logs, segments):
+    odd, even = (numbered(read_split(logs, frames=slice(i, None, 2))) for i in (0, 1))
+    by_instruments = lateral_by_instruments(odd, even, ("lever", "slip"))["parameters"]
+    plain = lateral(segments, ("lever", "slip"))["parameters"]
     for name, entry in plain.items():
         assert by_instruments[name]["value"] == pytest.approx(entry["value"], abs=0.004)
 
 
-def test_instruments_undo_the_attenuation_by_noise(capture):
+def test_instruments_undo_the_attenuation_by_noise():
     generator = np.random.default_rng(0)
     x, block = generator.normal(size=4000), np.arange(4000) // 100
     one, other = (x + 0.5 * generator.normal(size=4000) for _ in range(2))
-    plain = capture.regression(2 * x, {"lever": one}, block)
-    right = capture.regression(2 * x, {"lever": one}, block, instruments={"lever": other})
+    plain = regression(2 * x, {"lever": one}, block)
+    right = regression(2 * x, {"lever": one}, block, instruments={"lever": other})
     assert plain["parameters"]["lever"]["high"] < 1.75
     holds(right, {"lever": 2.0})
 
 
-def test_euler_form_finds_the_sign_that_is_predicted(capture, segments):
-    fit = capture.lateral_by_euler(segments, ("lever", "slip"))["parameters"]
-    alone = capture.lateral_by_euler(segments, ("lever",))["parameters"]["lever"]["value"]
-    continuous = capture.values(capture.lateral(segments, ("lever", "slip")))
-    predicted = capture.euler_from_continuous(segments, **continuous)
+def test_euler_form_finds_the_sign_that_is_predicted(segments):
+    fit = lateral_by_euler(segments, ("lever", "slip"))["parameters"]
+    alone = lateral_by_euler(segments, ("lever",))["parameters"]["lever"]["value"]
+    continuous = values(lateral(segments, ("lever", "slip")))
+    predicted = euler_from_continuous(segments, **continuous)
     assert continuous["slip"] < 0 < fit["slip"]["low"]
     assert fit["slip"]["value"] == pytest.approx(predicted["slip, Euler [s]"], abs=0.02)
     assert alone == pytest.approx(predicted["lever alone, Euler [m]"], abs=0.03)
 
 
-def test_speed_and_turn_responses_are_found(capture, segments):
-    holds(capture.fitted(capture.SPEED_RESPONSES["lag"], segments), SPEED)
-    fit = capture.fitted(capture.TURN_RESPONSES["lag, share, caster"], segments)
+def test_speed_and_turn_responses_are_found(segments):
+    holds(fitted(SPEED_RESPONSES["lag"], segments), SPEED)
+    fit = fitted(TURN_RESPONSES["lag, share, caster"], segments)
     holds(fit, TURN)
 
 
-def test_a_row_ahead_finds_the_same_numbers_and_the_noise(capture, segments):
-    rows = capture.as_rows(segments)
-    holds(capture.fitted(capture.SPEED_RESPONSES["lag"], rows), SPEED)
-    fit = capture.fitted(capture.TURN_RESPONSES["lag, share, caster"], rows)
+def test_a_row_ahead_finds_the_same_numbers_and_the_noise(segments):
+    rows = as_rows(segments)
+    holds(fitted(SPEED_RESPONSES["lag"], rows), SPEED)
+    fit = fitted(TURN_RESPONSES["lag, share, caster"], rows)
     holds(fit, TURN, within={"gain": 0.015, "lag": 0.015, "delay": 0.01, "caster": 0.12})  # by the smoothing
-    lateral = {name: TRUTH[name] for name in ("lever", "slip", "settling")}
-    noise = capture.process_noise(segments, {"speed": SPEED, "turn rate": TURN, "lateral response": lateral})
+    law = {name: TRUTH[name] for name in ("lever", "slip", "settling")}
+    noise = process_noise(segments, {"speed": SPEED, "turn rate": TURN, "lateral response": law})
     for sd, entry in zip(NOISE, noise["channels"].values(), strict=True):
         assert 0.7 * sd < entry["sd"]["value"] < 1.3 * sd  # rows begin within the intervals that noise is held for
     assert noise["rows"] == sum((len(s.time) - 1) // 10 for s in segments)
 
 
-def test_what_the_data_do_not_tell_has_no_interval(capture):
-    fit = capture.regression(np.arange(10.0), {"lever": np.arange(10.0), "slip": np.zeros(10)}, np.arange(10) // 2)
+def test_what_the_data_do_not_tell_has_no_interval():
+    fit = regression(np.arange(10.0), {"lever": np.arange(10.0), "slip": np.zeros(10)}, np.arange(10) // 2)
     assert fit["parameters"]["slip"]["low"] is None
-    assert "not determined" in capture.with_interval("slip", fit["parameters"]["slip"])
+    assert "not determined" in with_interval("slip", fit["parameters"]["slip"])
 
 
-def test_missing_logs_are_skipped_with_one_line(capture, tmp_path, capsys):
-    assert capture.main(["--data", str(tmp_path / "none")]) == 2
+def test_missing_logs_are_skipped_with_one_line(tmp_path, capsys):
+    assert main(["--data", str(tmp_path / "none")]) == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert line.startswith("skipped: ") and "train/" in line
     for name in ("train", "valid", "test"):
         (tmp_path / name).mkdir()
-    assert capture.main(["--data", str(tmp_path)]) == 2
+    assert main(["--data", str(tmp_path)]) == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert line.startswith("skipped: train/vrpn-pose.csv")
 
 
-def test_tables_and_numbers_are_written(capture, segments, tmp_path):
+def test_tables_and_numbers_are_written(segments, tmp_path):
     fits = [
         {"part": "lateral velocity", "split": "together", "variant": "0.25 s", "form": "lever"}
-        | capture.lateral(segments, ("lever",))
+        | lateral(segments, ("lever",))
     ]
-    noise = capture.process_noise(segments, {"speed": SPEED, "turn rate": TURN, "lateral response": LAW})
+    noise = process_noise(segments, {"speed": SPEED, "turn rate": TURN, "lateral response": LAW})
     result = {
         "settings": {"window [s]": 0.25, "degree": 3, "block [s]": 8.0, "draws": 1000, "seed": 0},
         "fits": fits,
-        "euler": {"together": capture.euler_from_continuous(segments, 0.38, -0.085)},
+        "euler": {"together": euler_from_continuous(segments, 0.38, -0.085)},
         "noise": {"together": noise},
     }
-    text = capture.markdown(result)
+    text = markdown(result)
     assert "| lever | together | 0.25 s | lever ." in text and "| forward | together |" in text
     file = tmp_path / "new" / "numbers.json"
-    capture.write(file, json.dumps(result, allow_nan=False))
+    write(file, json.dumps(result, allow_nan=False))
     assert json.loads(file.read_text()) == json.loads(json.dumps(result))
     assert [entry.name for entry in file.parent.iterdir()] == ["numbers.json"]
