@@ -9,7 +9,8 @@ from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import numpy as np
-from continuous_worlds import Array, Unicycle
+from continuous_effects import Array
+from continuous_worlds import Unicycle
 
 
 @dataclass(frozen=True)

@@ -24,8 +24,9 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 import pyro
 import pyro.distributions as dist
 import torch
-from continuous import ENGINE, GROUPS, LIMITS, discovered, plain, said, sized
+from continuous_groups import GROUPS
 from continuous_programs import CartProgram, PendulumProgram
+from continuous_searches import ENGINE, LIMITS, discovered, plain, said, sized
 from resumable import Record, run
 
 from steady_ppl import Program, WrappedNormal, load_program

@@ -33,9 +33,9 @@ import numpy as np
 import pyro
 import pyro.distributions as dist
 import torch
-from continuous import GROUPS, user_program
+from continuous_drives import simulate
+from continuous_groups import GROUPS, user_program
 from continuous_programs import PendulumProgram
-from continuous_worlds import simulate
 from torch import tensor
 
 from steady_ppl import Program, Trajectories, prove

@@ -22,8 +22,10 @@ from pathlib import Path
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import torch
-from continuous import GROUPS, LIMITS, SOURCES, plain, sized, user_program
-from continuous_worlds import Planted, simulate
+from continuous_drives import simulate
+from continuous_effects import Planted
+from continuous_groups import GROUPS, user_program
+from continuous_searches import LIMITS, SOURCES, plain, sized
 from resumable import Record, digest, run
 from scipy import stats
 

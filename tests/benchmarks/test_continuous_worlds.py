@@ -5,15 +5,21 @@ import math
 from dataclasses import replace
 from pathlib import Path
 
-import continuous
+import continuous_drives
+import continuous_effects
 import continuous_wheels
 import continuous_worlds
 import numpy as np
 import pytest
 import torch
-from continuous import GROUPS, exact_interval, planted_jobs, sized, user_program
+from continuous import planted_jobs
+from continuous_drives import integrate, simulate
+from continuous_effects import PLANAR, Body, Planted, acting
+from continuous_groups import GROUPS, user_program
+from continuous_searches import sized
+from continuous_tables import exact_interval, tables
 from continuous_wheels import Car, TwoWheels
-from continuous_worlds import PLANAR, Boat, Cart, Hovercraft, Pendulum, Planted, Unicycle, acting, integrate, simulate
+from continuous_worlds import Boat, Cart, Hovercraft, Pendulum, Unicycle, wrapped
 from scipy.integrate import solve_ivp
 
 from steady_ppl import for_program
@@ -196,7 +202,7 @@ def test_planted_effects_change_no_draw():
     one = simulate(world, 3, seed=6)
     other = simulate(replace(world, effects=(Planted("bearing_bias", (0.1,)), Planted("slope", (0.1, 0.0)))), 3, seed=6)
     assert torch.equal(one.controls, other.controls) and torch.equal(one.states[0], other.states[0])
-    shift = continuous_worlds.wrapped((other.measurements[0] - one.measurements[0]).numpy())
+    shift = wrapped((other.measurements[0] - one.measurements[0]).numpy())
     assert np.allclose(shift, 0.1)
 
 
@@ -209,7 +215,9 @@ def test_a_world_refuses_an_effect_that_it_has_not():
 
 
 def test_the_worlds_take_nothing_but_the_table_from_the_engine():
-    for module, allowed in ((continuous_worlds, ["Trajectories"]), (continuous_wheels, [])):
+    modules = (continuous_drives, continuous_effects, continuous_wheels, continuous_worlds)
+    for module in modules:
+        allowed = ["Trajectories"] if module is continuous_drives else []
         tree = ast.parse(Path(module.__file__).read_text())
         imports = [node for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)]
         taken = [node for node in imports if "steady" in (node.module or "")]
@@ -222,7 +230,7 @@ def test_planar_forces_are_those_of_the_catalogue(name):
     variant = chosen_variant(program, name)
     value = (0.7, -0.4)[: max(1, len(variant.effect.components))]
     state, control = torch.randn(5, 6), torch.randn(5, 2)
-    body = continuous_worlds.Body(
+    body = Body(
         *(one.numpy() for one in program.body_velocity(state)),
         *(one.numpy() for one in (state[:, 2].cos(), state[:, 2].sin(), *control.unbind(-1))),
     )
@@ -300,6 +308,6 @@ def test_tables_count_alarms_truths_and_intervals():
     found = {"effect": "stiffness", "interval_90": [[0.1, 0.3]]}
     right = {**loud, "found": [found], "planted": {"effect": "stiffness", "value": [0.2]}}
     second = {**loud, "found": [found], "planted": {"effect": "cubic_stiffness", "value": [0.2]}}
-    text = continuous.tables([quiet, loud], [right, second])
+    text = tables([quiet, loud], [right, second])
     assert "| cart | 1 of 2: 50.0% [1.3%, 98.7%] | yes | stiffness 1 | 1 2 |" in text
     assert "| all | 2 of 2: 100.0% [15.8%, 100.0%] | 1 of 2: 50.0% [1.3%, 98.7%] | 1 of 1: 100.0%" in text

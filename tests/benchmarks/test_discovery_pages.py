@@ -6,11 +6,11 @@ import json
 from pathlib import Path
 from typing import Any
 
-import continuous
+import continuous_tables
 import discovery_boat
 import discovery_conditions
 
-RESULTS = Path(continuous.__file__).with_name("results")
+RESULTS = Path(continuous_tables.__file__).with_name("results")
 
 
 def records(name: str) -> list[dict[str, Any]]:
@@ -27,5 +27,5 @@ def test_other_conditions() -> None:
 
 
 def test_continuous_time() -> None:
-    page = continuous.tables(records("continuous-alarms"), records("continuous-planted"))
+    page = continuous_tables.tables(records("continuous-alarms"), records("continuous-planted"))
     assert (RESULTS / "continuous.md").read_text().startswith(page.rstrip())

@@ -13,8 +13,9 @@ import pyro.distributions as dist
 import pytest
 import scipy.linalg
 import torch
+from continuous_drives import simulate as in_continuous_time
 from continuous_programs import UnicycleProgram
-from continuous_worlds import Hovercraft, Unicycle, simulate as in_continuous_time
+from continuous_worlds import Hovercraft, Unicycle
 from examples import MODELS, example
 from pyro.distributions import constraints
 from pyro.nn import PyroParam
