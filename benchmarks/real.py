@@ -29,6 +29,8 @@ from torch import Tensor, tensor
 
 import steady_ppl
 from inference import likelihood
+from models.car import Car
+from models.unicycle import Unicycle
 from steady_ppl import (
     Fit,
     Trajectories,
@@ -46,7 +48,6 @@ from steady_ppl.sensors import Bearings, Position, Ranges
 ROOT = Path(__file__).parents[1]
 RESULT = Path(__file__).parent / "results" / "real.jsonl"
 STEPS = 100  # of a fit
-Car, Unicycle = (type(load_program(ROOT / "models" / name)) for name in ("car.py", "unicycle.py"))
 ANTENNA, WHEELBASE, STEERING = (3.4, 3.7), (2.73, 2.93), (0.0, 0.01)  # m, m, rad: robust least squares, the car's maker
 CAPTURED = {
     "speed gain": 0.925,
