@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from matplotlib.figure import Figure
 
-from steady_ppl import Program, Trajectories, load_program, simulate
+from steady_ppl import Program, Trajectories, from_arrays, load_program, simulate
 from steady_ppl.effects import Effect, catalogue
 from steady_ppl.model.program import for_program, names, unit_of, units
 from steady_ppl.sensors import BodyVelocity
@@ -29,16 +29,20 @@ PROGRAMS = ("hovercraft", "truck", "pendulum", "car", "differential_drive")
 QUIET = 0.1  # of the channels' noise, so that the effect is seen; but for effects on that noise
 # of drives on which much happens
 SEEDS = {"hovercraft": 4, "truck": 3, "pendulum": 4, "car": 1, "differential_drive": 1}
+LONG_ROW, SWING = 1.0, 1.2  # s, rad/s: rows and controls that show what a control does within a row
 WITH, WITHOUT = "#d55e00", "#0072b2"  # Okabe and Ito
 HEAD = """# Effect gallery
 
-What could be missing, what it looks like and what it is taken for. Pictures: the same drive, the same commands and \
-the same noise (a tenth of the program's, but for effects on that noise), blue without the effect and orange with it, \
-at its typical size. Confusions are those of the [discovery \
-benchmark](../benchmarks/results/discovery-continuous.md): hovercraft drives on which one effect was planted \
-alone, most of them small; an effect is *in the class* when the search named it \
-or said that the drives cannot tell it from what it named. A confusion that more drives would not mend is mended by \
-other controls: `steady discover` proposes them.
+Every effect of the catalogue: its equation, its look, and the effects it is confused with.
+
+Each picture has one trajectory twice, with the same controls and noise: blue without the effect, orange with it at \
+its typical size. The noise is a tenth of the model's, except for effects on that noise. `first_order_hold` has rows \
+of 1 s.
+
+Confusions are counted in the [discovery benchmark](../benchmarks/results/discovery-continuous.md): hovercraft \
+trajectories with one effect, in most sets a small one. An effect is *in the class* if the search named it, or \
+reported that the data cannot tell it from the one it named. Where more data would not end a confusion, other \
+controls do: `steady discover` proposes them.
 
 [The catalogue as a table](effects.md) has units, typical sizes and options; [how a search decides](discovery.md).
 """
@@ -92,7 +96,7 @@ def confusions(effect: Effect, records: list[dict]) -> str:
         if not record["withheld"] and [name_of(one) for one in record["effects"]] == [effect.name]
     ]
     if not planted or program_of(effect)[0] != "hovercraft":
-        return "Taken for: not measured; the benchmark's hovercraft cannot have it, or it was not planted there."
+        return "Confused with: not measured; the benchmark's hovercraft cannot have it, or it was not planted there."
     inside = sum(effect.name in map(name_of, record["class"]) for record in planted)
     others = Counter(one for record in planted for one in {*map(name_of, record["class"])} - {effect.name})
     behind = Counter(
@@ -101,7 +105,7 @@ def confusions(effect: Effect, records: list[dict]) -> str:
     said = ", ".join(f"`{name}` ({count})" for name, count in others.most_common(3)) or "nothing"
     nearest = ", ".join(f"`{name}` ({count})" for name, count in behind.most_common(2))
     return (
-        f"Taken for: in the class in {inside} of {len(planted)} sets; also there: {said}. "
+        f"Confused with: in the class in {inside} of {len(planted)} sets; also there: {said}. "
         f"Ranked next to it most often: {nearest}."
     )
 
@@ -134,7 +138,8 @@ def program_of(effect: Effect) -> tuple[str, Program]:
 def picture(effect: Effect) -> Figure:
     """The path, or the phase plane, and over time what changed most."""
     name, program = program_of(effect)
-    drives = [simulate(one, 1, seed=SEEDS[name]) for one in (program, program.with_effect(effect))]
+    like = swinging(program) if effect.form == "between" else None
+    drives = [simulate(one, 1, seed=SEEDS[name], like=like) for one in (program, program.with_effect(effect))]
     figure = Figure(figsize=(9, 2.8), layout="constrained")
     left, right = figure.subplots(1, 2, width_ratios=(1, 1.6))
     across, up = ("x", "y") if "x" in drives[0].state_names else drives[0].state_names[:2]
@@ -153,6 +158,14 @@ def picture(effect: Effect) -> Figure:
     right.set_xlabel("time [s]")
     right.set_ylabel(name, fontsize=8)
     return figure
+
+
+def swinging(program: Program) -> Trajectories:
+    """Twenty seconds of long rows, with controls that change from each to the next."""
+    time = np.arange(0, 20 + LONG_ROW / 2, LONG_ROW)
+    controls = {f"u.{name}": 0.6 + 0.6 * np.sin(SWING * time / (i + 1)) for i, name in enumerate(program.control_names)}
+    measured = {f"y.{name}": np.zeros_like(time) for name in program.measurement_names}
+    return from_arrays([{"time": time, **controls, **measured}])
 
 
 def most_changed(effect: Effect, program: Program, drives: list[Trajectories]) -> tuple[str, list[np.ndarray]]:
