@@ -58,7 +58,7 @@ def tables(records: Records, runs: int = RUNS, *, quick: bool = False) -> str:
     ]
     parts += [_in_short(by_filter, marks, *short) for short in SHORT]
     for title, (metric, group, digits) in TABLES.items():
-        lines = [f"### {title}\n", f"| | {' | '.join(f'{name} | published' for name in EXPERIMENTS.values())} |"]
+        lines = [f"## {title}\n", f"| | {' | '.join(f'{name} | published' for name in EXPERIMENTS.values())} |"]
         lines.append("|---|" + "---|---|" * len(EXPERIMENTS))
         for method, name in METHODS.items():
             cells = []
@@ -73,12 +73,12 @@ def tables(records: Records, runs: int = RUNS, *, quick: bool = False) -> str:
         parts.append("\n".join(lines) + "\n")
     parts += [HAND + "\n", NOISE + "\n", *_guides(records)]
     if failed:
-        parts += ["### Runs that failed\n", _listed(f"{name}: {why}" for name, why in failed.items())]
+        parts += ["## Runs that failed\n", _listed(f"{name}: {why}" for name, why in failed.items())]
     if quick:
         parts.append(QUICK)
     else:
-        parts += ["### The filter\n", paper_filters.TEXT + "\n", _listed(paper_filters.filters(records))]
-        parts += ["### What must hold\n", _listed(paper_musts.shown(records, runs))]
+        parts += ["## The filter\n", paper_filters.TEXT + "\n", _listed(paper_filters.filters(records))]
+        parts += ["## What must hold\n", _listed(paper_musts.shown(records, runs))]
     return "\n".join(parts).rstrip() + "\n"
 
 
@@ -96,7 +96,7 @@ def _guides(records: Records) -> list[str]:
 def _in_short(records: Records, marks: Marks, metric: str, title: str, digits: int) -> str:
     """Means alone, location / angle, ours and in brackets the published."""
     theirs = published()
-    lines = [f"### In short: {title}, location [m] / angle [rad], ours (published)\n"]
+    lines = [f"## In short: {title}, location [m] / angle [rad], ours (published)\n"]
     lines += [f"| | {' | '.join(EXPERIMENTS.values())} |", "|---" * (len(EXPERIMENTS) + 1) + "|"]
     for method, name in METHODS.items():
         cells = []

@@ -36,7 +36,7 @@ def test_the_filed_tables_are_those_of_the_filed_records(records: list[Record]) 
 
 def test_the_page_shows_the_short_tables() -> None:
     filed, page = (file.read_text() for file in (RESULTS / "paper.md", ROOT / "docs" / "results-paper.md"))
-    parts = [part for part in filed.split("### ") if part.startswith("In short")]
+    parts = [part for part in filed.split("## ") if part.startswith("In short")]
     assert len(parts) == 2
     for part in parts:
         _, rows = part.split("\n\n", 1)

@@ -64,7 +64,7 @@ def test_the_published_digits_are_those_that_were_held_against_the_paper() -> No
 
 def test_ours_are_means_spreads_and_the_best() -> None:
     text = tables([record("steady", 1, 0.1), record("steady", 2, 0.3), record("hand", 1, 0.5)], 2)
-    part = text.split("### ")[3:]
+    part = text.split("## ")[3:]
     assert "| STEADY | – (0.0428 / 0.0140) | 0.2000 / 0.0200 (0.0382 / 0.0128) |" in text
     assert "| STEADY | – (0.380 / 0.033) | 0.200 / 0.020 (0.350 / 0.031) |" in text
     location, likelihood = part[0], next(one for one in part if one.startswith("log p(y)"))
@@ -78,7 +78,7 @@ def test_the_spread_is_what_the_noise_adds_to_the_mean_roll_out() -> None:
     one = record("steady", 1, 0.5)
     one["forward_mean"] = {"location": 0.4, "angle": 0.03}
     text = tables([one], 1)
-    location, angle = (part for part in text.split("### ") if part.startswith("Spread"))
+    location, angle = (part for part in text.split("## ") if part.startswith("Spread"))
     assert "| STEADY | – | – | 0.3000 | – | – | – |" in location and "| 0.0400 |" in angle
 
 
@@ -208,7 +208,7 @@ def test_runs_without_a_bootstrap_are_named() -> None:
 def test_where_one_run_differs_all_are_shown_by_the_bootstrap_and_marked() -> None:
     same, apart = checked("hand", 0.0, 0.002, seed=1), checked("hand", 1.0, 0.1, 0.01, seed=2)
     text = tables([same, apart, checked("steady", 0.0, 0.001)], 2)
-    location, angle, forward, *_ = text.split("### ")[3:]
+    location, angle, forward, *_ = text.split("## ")[3:]
     assert "| 0.351 ± 0.069 (0.302)ᵇ |" in location and "| 0.300 (1 of 2) |" in location
     assert "| 0.0350 ± 0.0071 (0.0300)ᵇ |" in angle
     assert "| Hand | – (1.209 / 0.601) | 0.351 / 0.035ᵇ (1.206 / 0.550) |" in text
