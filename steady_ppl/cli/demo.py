@@ -66,8 +66,8 @@ class Demo:
 DEMO_RECORD = "demo.json"  # of a demonstration; a folder without one is not a demonstration's
 OWNER_PROGRAM = "models/hovercraft.py"
 INTRODUCTION = (
-    "A hovercraft whose owner's program knows no drag. What it did is known only by noisy bearings to four landmarks, "
-    "the controls, and where each drive began (--known-start: exactly, as in the paper)."
+    "A hovercraft has drag, and its program has none. The data are noisy bearings to four landmarks, the controls, and "
+    "the first state of each drive (--known-start, as in the paper)."
 )
 
 
@@ -105,9 +105,9 @@ def demonstrate(
     say(f"\n   $ cd {shlex.quote(str(out))}")
     with chdir(out):
         record_drives(demo, size)
-        demo.step("Fit the owner's program, which has none")
+        demo.step("Fit the program without drag")
         demo.result(_fit(demo, OWNER_PROGRAM, "before"))
-        demo.step("Compare: does it explain even the drives that it was fitted to?")
+        demo.step("Check: does it fit the drives of its own fit?")
         sets = size.calibration
         demo.steady(f"check runs/before train.csv{sets} --json check.json --picture check.png", keep="check.txt")
         demo.result(read_json(Path("check.json"), RunError)["verdict"])
@@ -131,16 +131,16 @@ def demonstrate(
 
 
 def record_drives(demo: Demo, size: Size) -> None:
-    """Simulate drives of a hovercraft with drag, and forget its poses."""
-    demo.step("Record drives, of a hovercraft that does have drag")
+    """Simulate drives of a hovercraft with drag, and drop its poses."""
+    demo.step("Simulate drives of a hovercraft with drag")
     for seed, (name, count) in enumerate((("train", size.train), ("valid", size.valid), ("test", size.test)), 1):
         demo.steady(f"simulate {TRUE_PROGRAM} --trajectories {count} --seed {seed} --out {name}.csv")
     for table in ("train.csv", "valid.csv"):
         st.write_table(st.read_table(table).without_truth(keep_start=True), table)
     demo.result(
-        f"{size.train} drives to fit and {size.valid} to choose by: of both only controls, bearings and the first "
-        f"state are kept. {size.test} more are locked away for the proof, with their poses, to judge by. The "
-        "hovercraft moves in steps of 5 ms, its programs in those of the rows."
+        f"{size.train} drives for the fit and {size.valid} for validation keep controls, bearings and the first state. "
+        f"{size.test} more with true poses are held out for the proof. The hovercraft moves in steps of 5 ms, its "
+        "programs in those of the rows."
     )
 
 
@@ -172,8 +172,8 @@ def add(demo: Demo, effects: Sequence[str]) -> str:
 
 
 def prove(demo: Demo) -> None:
-    """Before and after on the locked drives."""
-    demo.step("Prove: on the locked drives, which nothing has seen so far")
+    """Before and after on the held-out drives."""
+    demo.step("Prove: on the held-out drives")
     demo.steady(
         f"prove runs/before runs/after test.csv --oracle runs/oracle --truth {TRUE_PROGRAM} "
         "--json proof.json --picture proof.png",
@@ -230,7 +230,7 @@ def demo(
     out: Annotated[Path, typer.Option("--out", help="Folder to write.")] = Path("out/demo"),
     force: Annotated[bool, typer.Option("--force", help="Write into a folder that is no demo's.")] = False,
 ) -> None:
-    """Show the whole loop: check, discover, add, fit again, prove, on a hovercraft whose program has no drag.
+    """Run the whole loop (check, discover, add, fit again, prove) on a hovercraft whose program has no drag.
 
     It prints the commands that it runs, with what they found, and keeps drives, programs, runs and pictures.
     """

@@ -21,10 +21,10 @@ SIMULATIONS = 100  # sets for the bands of a report
 
 def doctor(
     table: Annotated[Path, typer.Argument(help="Table, .csv or .parquet.")],
-    model: Annotated[str | None, typer.Argument(help="Program whose units and step are known.")] = None,
+    model: Annotated[str | None, typer.Argument(help="Program: its units and step are used.")] = None,
     json_file: common.Json = None,
 ) -> None:
-    """Say what is suspicious in a table, before anything is fitted, and the line that mends it."""
+    """List suspicious cells of a table, each with the line that mends it."""
     require_place(json_file)
     found = st.doctor(table, None if model is None else program_from(model, 0))
     present(str(found), found.figures, json_file)
@@ -32,21 +32,19 @@ def doctor(
 
 def check(
     run: common.Run,
-    table: Annotated[Path, typer.Argument(help="Drives to compare with, best others than those of the fit.")],
+    table: Annotated[Path, typer.Argument(help="Drives, preferably not those of the fit.")],
     json_file: common.Json = None,
-    picture: Annotated[Path | None, typer.Option(help="Draw the picture into this file, for example .png.")] = None,
+    picture: Annotated[Path | None, typer.Option(help="Picture to write, for example .png.")] = None,
     mask: Annotated[
         Path | None,
-        typer.Option(
-            help="Write the table without outliers and stretches that nobody measured, for fits and checks, here."
-        ),
+        typer.Option(help="Table to write without outliers and interpolated stretches."),
     ] = None,
     simulations: Annotated[int, common.count("Simulated sets for the bands.", least=20)] = 100,
     horizon: common.Horizons = None,
     program: common.Moved = None,
     seed: common.Seed = 0,
 ) -> None:
-    """Compare a run with measurements: where, when and in which regime it fails, and who is at fault."""
+    """Compare a run with measurements: where, when and in which regime it fails, and which part is wrong."""
     from steady_ppl.data.frozen_sensors import without_stretches
     from steady_ppl.data.table import require_table_file
 
@@ -68,21 +66,21 @@ def check(
     if mask is not None:
         st.write_table(found.outliers.without(without_stretches(drives, found.stuck)), mask)
         count, cells = len(found.stuck), found.outliers.cells
-        stretches = f"{count} stretch{'' if count == 1 else 'es'} that nobody measured"
+        stretches = f"{count} unmeasured stretch{'' if count == 1 else 'es'}"
         say(f"{mask}: {table.name} without {stretches} and {counted(cells, 'wrong reading')}")
 
 
 def prove(
     arguments: common.RunsAndTable,
-    truth: Annotated[str | None, typer.Option(help="The program that made the drives, if it is known.")] = None,
-    oracle: Annotated[Path | None, typer.Option(help="A run of the true structure, fitted like the others.")] = None,
+    truth: Annotated[str | None, typer.Option(help="Program that simulated the drives, if there is one.")] = None,
+    oracle: Annotated[Path | None, typer.Option(help="Run of the true structure, fitted like the others.")] = None,
     json_file: common.Json = None,
-    picture: Annotated[Path | None, typer.Option(help="Draw the errors into this file, for example .png.")] = None,
+    picture: Annotated[Path | None, typer.Option(help="Picture of the errors to write, for example .png.")] = None,
     horizon: common.Horizons = None,
     program: Annotated[list[str] | None, common.moved("once for each RUN and the oracle, in order")] = None,
     seed: common.Seed = 0,
 ) -> None:
-    """Prove that runs are better than the first one: log p(y), open-loop errors and noise, with paired intervals.
+    """Compare runs with the first: log p(y), open-loop errors and noise, with paired intervals.
 
     `steady evaluate RUN... TABLE` gives each run's errors alone, against true states where the table has them.
     """
@@ -114,7 +112,7 @@ def evaluate(
     seed: common.Seed = 0,
     surveyed: Annotated[
         str | None,
-        typer.Option("--map", help="The same vehicle with the true landmarks, for runs that learned theirs."),
+        typer.Option("--map", help="Program of the same vehicle with the true landmarks, for runs that learn theirs."),
     ] = None,
     program: Annotated[list[str] | None, common.moved("with several RUNs once for each, in their order")] = None,
 ) -> None:
@@ -167,7 +165,7 @@ def states(
     program: common.Moved = None,
     seed: common.Seed = 0,
 ) -> None:
-    """Write where the vehicle probably was, given all measurements of a drive: posterior draws of its states.
+    """Write posterior draws of the states, given all measurements of a drive.
 
     The table has for each state its median and the ends of its 90 % interval, `…_low` and `…_high`.
     """
@@ -191,9 +189,9 @@ def report(
     out: Annotated[Path, typer.Option("--out", help="The page to write.")] = Path("report.html"),
     discovery: Annotated[
         Path | None,
-        typer.Option(help="What `steady discover` found: its RUN or its --json file, if none of the RUNs has it."),
+        typer.Option(help="Run of `steady discover`, or its --json file, if none of the RUNs has it."),
     ] = None,
-    title: Annotated[str | None, typer.Option(help="Of the page; the runs' names when not given.")] = None,
+    title: Annotated[str | None, typer.Option(help="Title of the page; the runs' names when not given.")] = None,
     simulations: Annotated[int, common.count("Simulated sets for the bands.", least=20)] = SIMULATIONS,
     horizon: common.Horizons = None,
     program: Annotated[list[str] | None, common.moved("once for each RUN, in order")] = None,
@@ -201,7 +199,7 @@ def report(
 ) -> None:
     """Write one page of HTML: verdict, measured against predicted, where it fails, what is missing, before and after.
 
-    What `steady discover … --out RUN` found is shown if one of the runs is such a RUN. The page needs no network.
+    The result of `steady discover … --out RUN` is shown if RUN is one of the runs. The page needs no network.
     """
     from steady_ppl.discovery.result import read_discovery
     from steady_ppl.runs.recipes import fingerprint

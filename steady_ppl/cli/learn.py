@@ -26,12 +26,12 @@ def fit(
     model: common.Model,
     table: Annotated[Path, typer.Argument(help="Training drives, .csv or .parquet.")],
     out: Annotated[Path, typer.Option("--out", help="Run folder to write.")],
-    valid: Annotated[Path | None, typer.Option(help="Held-out drives that decide when to stop.")] = None,
+    valid: Annotated[Path | None, typer.Option(help="Held-out drives: the stopping rule.")] = None,
     recipe: Annotated[
         str | None,
         typer.Option(
-            help=f"{', '.join(RECIPES)}, or a recipe of your own: PATH.py. The one that suits MODEL when not given: "
-            "likelihood for some dozens of numbers that can be linearised, else steady.",
+            help=f"{', '.join(RECIPES)}, or a recipe of your own: PATH.py. By default the one that suits MODEL: "
+            "likelihood for some dozens of parameters and a model that can be linearised, else steady.",
             autocompletion=lambda incomplete: [name for name in RECIPES if name.startswith(incomplete)],
         ),
     ] = None,
@@ -46,11 +46,11 @@ def fit(
     steps: Annotated[int | None, common.count("E steps.")] = None,
     setting: Annotated[
         list[str] | None,
-        typer.Option("--set", metavar="NAME=VALUE", help="Any other setting of the recipe, for example ramp=0.7."),
+        typer.Option("--set", metavar="NAME=VALUE", help="Another setting of the recipe, for example ramp=0.7."),
     ] = None,
     seed: common.Seed = 0,
     device: Annotated[Literal["cpu", "cuda"], typer.Option(help="Where to compute.")] = "cpu",
-    resume: Annotated[bool, typer.Option("--resume", help="Go on with an interrupted run.")] = False,
+    resume: Annotated[bool, typer.Option("--resume", help="Continue an interrupted run.")] = False,
     force: common.Overwrite = False,
 ) -> None:
     """Learn a program's parameters from measurements."""
@@ -80,7 +80,7 @@ def fit(
             rise = f"{first:.2f} → {kept:.2f} at step {result.trained.kept}"
             tell(f"held-out log p(y) of a drive {rise}, whose parameters were kept")
         if result.trained.interrupted:
-            say(f"interrupted; the run so far is usable, `--resume` goes on with {out}")
+            say(f"interrupted; the run so far is usable, `--resume` continues {out}")
             raise typer.Exit(1)
 
 
@@ -107,42 +107,42 @@ def discover(
     source: Annotated[str, typer.Argument(metavar="RUN|MODEL", help="A run folder, or a program to fit first.")],
     table: Annotated[Path, typer.Argument(help="Drives to test and fit.")],
     valid: Annotated[
-        Path | None, typer.Option(help="Drives to choose by; every second drive of TABLE when not given.")
+        Path | None, typer.Option(help="Validation drives; every second drive of TABLE when not given.")
     ] = None,
     known_start: Annotated[
         bool | None,
         typer.Option(help="Give the first row's x. columns as the exact start; a RUN's own setting when not given."),
     ] = None,
     substeps: common.Substeps = None,
-    mix: Annotated[
-        bool, typer.Option("--mix", help="Put both tables together and keep every second drive to choose by.")
-    ] = False,
+    mix: Annotated[bool, typer.Option("--mix", help="Join both tables and validate on every second drive.")] = False,
     out: Annotated[Path | None, typer.Option("--out", help="Run folder for the improved fit.")] = None,
     json_file: common.Json = None,
-    picture: Annotated[Path | None, typer.Option(help="Draw what was found into this file, for example .png.")] = None,
+    picture: Annotated[Path | None, typer.Option(help="Picture to write, for example .png.")] = None,
     simulations: Annotated[int, common.count("Simulated sets for the calibration.", least=50)] = 200,
     withhold: Annotated[
-        list[str] | None, typer.Option(metavar="EFFECT", help="Leave an effect out of the search; as often as needed.")
+        list[str] | None, typer.Option(metavar="EFFECT", help="Leave an effect out of the search; repeat for several.")
     ] = None,
     only: Annotated[
         list[str] | None,
-        typer.Option(metavar="KIND", help="Look for one kind alone: dynamics, actuator, sensor or noise; or for some."),
+        typer.Option(
+            metavar="KIND", help="Search this kind only: dynamics, actuator, sensor or noise; repeat for several."
+        ),
     ] = None,
     minutes: Annotated[
-        float | None, typer.Option(help="End the search after so long, with what it has found.", min=0.01)
+        float | None, typer.Option(help="Minutes after which the search ends with its result so far.", min=0.01)
     ] = None,
     program: common.MovedOfRun = None,
     seed: common.Seed = 0,
-    resume: Annotated[bool, typer.Option("--resume", help="Go on with a search that was stopped.")] = False,
+    resume: Annotated[bool, typer.Option("--resume", help="Continue a search that was stopped.")] = False,
     force: common.Overwrite = False,
 ) -> None:
-    """Learn which physical effect a program lacks: none, one by name, several, or a curve that has no name."""
+    """Identify missing effects: none, one or several of the catalogue, or a curve without a name."""
     from steady_ppl.discovery.discover import kept_search
     from steady_ppl.runs.folder import DISCOVERY, JOURNAL
     from steady_ppl.runs.recipes import fingerprint
 
     if out is None and resume:
-        raise UsageError("--resume goes on with a search in its run folder: name it (--out)")
+        raise UsageError("--resume continues the search of a run folder: name it (--out)")
     if out is not None and out.exists() and not (force or resume):
         raise RunError(f"{out} exists: choose another folder, or --force to overwrite, or --resume to go on")
     require_picture(picture)
@@ -165,7 +165,7 @@ def discover(
     except KeyboardInterrupt as stop:  # before there was anything to show, or once more
         remarks = ["interrupted", *map(str, stop.args)]
         if out is not None and (out / JOURNAL).is_dir():
-            remarks.append(f"`--resume` goes on with {out}")
+            remarks.append(f"`--resume` continues {out}")
         say("; ".join(remarks), always=True)
         raise typer.Exit(1) from stop
     if out is not None:
@@ -175,7 +175,7 @@ def discover(
 
         write_picture(discovery_picture(found), picture)
     if found.search.interrupted:
-        usable = "" if out is None else f"; the run so far is usable, `--resume` goes on with {out}"
+        usable = "" if out is None else f"; the run so far is usable, `--resume` continues {out}"
         stopped = f"stopped after {minutes:g} min" if over.is_set() else "interrupted"
         say(f"{stopped} while {found.search.interrupted}{usable}", always=True)
         if not over.is_set():
@@ -214,7 +214,7 @@ def add(
 
 
 def effects(
-    model: Annotated[str | None, typer.Argument(help="Only those that this program could have, and why.")] = None,
+    model: Annotated[str | None, typer.Argument(help="List only the effects that apply to this program.")] = None,
 ) -> None:
     """List the physical effects that a program may lack."""
     from steady_ppl.effects.registry import page
@@ -223,19 +223,19 @@ def effects(
 
 
 def study(
-    plan: Annotated[Path, typer.Argument(metavar="STUDY.toml", help="What is compared with what.")],
+    plan: Annotated[Path, typer.Argument(metavar="STUDY.toml", help="File of the study.")],
     out: Annotated[Path, typer.Option("--out", help="Folder of the results; an existing one is resumed.")],
     workers: Annotated[int | None, common.count("Processes of this machine; its cores when not given.")] = None,
     cluster: Annotated[
         str | None, typer.Option(metavar="ADDRESS", help="A Dask scheduler, tcp://HOST:PORT, in place of processes.")
     ] = None,
     data: Annotated[Path | None, typer.Option(help="Folder of the logs or tables, if elsewhere.")] = None,
-    again: Annotated[bool, typer.Option("--again", help="Try jobs that have failed once more.")] = False,
+    again: Annotated[bool, typer.Option("--again", help="Repeat failed jobs.")] = False,
 ) -> None:
     """Compute a grid of programs, data, recipes, settings and seeds, each job by itself.
 
-    Results come into DIR/results.parquet, a row a job. The same command goes on where it was stopped, and computes only
-    what is not there or has changed. `steady plot-study DIR` draws it.
+    Results come into DIR/results.parquet, a row a job. The same command resumes, and computes only what is
+    missing or has changed. `steady plot-study DIR` draws it.
     """
     import joblib
 

@@ -48,7 +48,7 @@ def add_command(function: Callable[..., None], about: str, *examples: str, hidde
     app.command(function.__name__.replace("_", "-"), short_help=about, epilog=epilog, hidden=hidden)(function)
 
 
-add_command(demo.demo, "Show the whole loop on drives with a hidden effect.", "steady demo --out demo")
+add_command(demo.demo, "Run the whole loop on drives with a hidden effect.", "steady demo --out demo")
 add_command(make.init, "Make a folder to work in, with first drives.", "steady init lab")
 add_command(
     new.new,
@@ -81,7 +81,7 @@ add_command(
 )
 add_command(
     judge.doctor,
-    "Say what is suspicious in a table.",
+    "List suspicious cells of a table.",
     "steady doctor drives.csv",
     "steady doctor drives.csv mine.py --json findings.json",
 )
@@ -94,13 +94,13 @@ add_command(
 )
 add_command(
     judge.check,
-    "Say where and when a run fails, and who is at fault.",
+    "Compare a run with data: where does it fail, and why?",
     "steady check runs/first test.csv --picture check.png",
     "steady check runs/first test.csv --quiet --json - | jq .who",
 )
 add_command(
     learn.discover,
-    "Learn which physical effect a program lacks, or none.",
+    "Identify missing physical effects, or none.",
     "steady discover runs/first train.csv --valid valid.csv --out runs/found",
     "steady discover mine.py drives.csv --json found.json",
 )
@@ -112,7 +112,7 @@ add_command(
 )
 add_command(
     judge.prove,
-    "Prove on other drives that runs are better than the first.",
+    "Compare runs on held-out drives.",
     "steady prove runs/before runs/after test.csv --picture proof.png",
 )
 add_command(
@@ -123,12 +123,12 @@ add_command(
 )
 add_command(
     judge.report,
-    "Write all of it on one page of HTML.",
+    "Write one page of HTML with all results.",
     "steady report runs/before runs/after test.csv --discovery runs/found --out report.html",
 )
 add_command(
     judge.states,
-    "Write where the vehicle probably was.",
+    "Write posterior draws of the states.",
     "steady states runs/after test.csv --out states.csv",
     "steady states runs/after test.csv --draws 200 --out states.nc",
 )
@@ -138,12 +138,10 @@ add_command(
     "steady study studies/observation-noise.toml --data logs --out noise",
     "steady study mine.toml --cluster tcp://scheduler:8786 --out mine",
 )
-add_command(
-    learn.plot_study, "Draw what a study has found so far.", "steady plot-study noise --out noise.png", hidden=True
-)
+add_command(learn.plot_study, "Draw the results of a study.", "steady plot-study noise --out noise.png", hidden=True)
 add_command(
     learn.effects,
-    "List the physical effects that a program may lack.",
+    "List the physical effects of the catalogue.",
     "steady effects",
     "steady effects models/hovercraft.py",
     hidden=True,

@@ -40,9 +40,9 @@ def init(folder: Annotated[Path, typer.Argument(metavar="DIR", help="The folder 
 Out = Annotated[Path | None, typer.Option("--out", help="Table to write, .csv or .parquet.")]
 Maps = Annotated[
     list[str] | None,
-    typer.Option("--map", metavar="COLUMN=TOPIC:FIELD[,KEY=VALUE...]", help="One more column; as often as needed."),
+    typer.Option("--map", metavar="COLUMN=TOPIC:FIELD[,KEY=VALUE...]", help="Another column; repeat for several."),
 ]
-Step = Annotated[float | None, typer.Option(help="Seconds between rows; before that of MAPPING.toml.")]
+Step = Annotated[float | None, typer.Option(help="Seconds between rows; overrides MAPPING.toml.")]
 
 
 def import_bag(
@@ -79,8 +79,8 @@ def import_log(
     out: Out = None,
     column: Maps = None,
     step: Step = None,
-    begin: Annotated[float | None, typer.Option("--from", help="Seconds of each log to leave out at first.")] = None,
-    end: Annotated[float | None, typer.Option("--to", help="Seconds of each log after which nothing is read.")] = None,
+    begin: Annotated[float | None, typer.Option("--from", help="Second of each log at which to begin.")] = None,
+    end: Annotated[float | None, typer.Option("--to", help="Second of each log at which to end.")] = None,
 ) -> None:
     """Turn PX4 and ArduPilot logs into a table; without a mapping, list what is in them.
 
@@ -158,7 +158,7 @@ def alpha_truck(
     out: common.Table,
     sigma_deg: Annotated[float, typer.Option(help="Standard deviation of the simulated bearings, degrees.")] = 5.0,
     centred: Annotated[
-        bool, typer.Option("--centred", help="Velocities of each row itself, not the authors' of half a row later.")
+        bool, typer.Option("--centred", help="Velocities at each row, not half a row later as the authors have them.")
     ] = False,
     seed: common.Seed = 0,
 ) -> None:
@@ -203,14 +203,14 @@ def simulate(
     out: common.Table,
     trajectories: Annotated[int | None, common.count("How many drives, 16 when not given.")] = None,
     seed: common.Seed = 0,
-    controls: Annotated[Path | None, typer.Option(help="Take time, controls and gaps from this table.")] = None,
+    controls: Annotated[Path | None, typer.Option(help="Table whose times, controls and gaps are used.")] = None,
     substeps: Annotated[
         int | None,
-        typer.Option(help="Steps of the program in each row; so many that they are 5 ms or less when not given."),
+        typer.Option(help="Steps of the program in each row; enough for 5 ms or less when not given."),
     ] = None,
     effect: Annotated[
         list[str] | None,
-        typer.Option(metavar="NAME[=VALUE]", help="Add a physical effect, see `steady effects`; as often as needed."),
+        typer.Option(metavar="NAME[=VALUE]", help="Add a physical effect, see `steady effects`; repeat for several."),
     ] = None,
 ) -> None:
     """Simulate drives of a program, with measurements and true states."""

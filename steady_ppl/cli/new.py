@@ -37,29 +37,29 @@ class Parts:
 
 def new(
     file: Annotated[Path, typer.Argument(metavar="FILE.py", help="Model to write.")],
-    table: Annotated[Path | None, typer.Argument(help="Drives whose columns say what there is.")] = None,
+    table: Annotated[Path | None, typer.Argument(help="Table whose columns name controls and sensors.")] = None,
     vehicle: Annotated[
         str | None, typer.Option(metavar="KIND", help="A file of models/ that lists sensors: car, unicycle, …")
     ] = None,
     sensor: Annotated[
         list[str] | None,
-        typer.Option(metavar=SENSOR_FORM, help="As position=gps:0.3; as often as needed. Before what TABLE says."),
+        typer.Option(metavar=SENSOR_FORM, help="As position=gps:0.3; repeat for several. Overrides TABLE."),
     ] = None,
     control: Annotated[
         list[str] | None,
-        typer.Option(metavar="COLUMN=CONTROL", help="What a control of TABLE is: delta=steering; as often as needed."),
+        typer.Option(metavar="COLUMN=CONTROL", help="Control of a column: delta=steering; repeat for several."),
     ] = None,
     landmark: Annotated[
-        list[str] | None, typer.Option(metavar="X,Y", help="A landmark, m; once for each, in the order of columns.")
+        list[str] | None, typer.Option(metavar="X,Y", help="Landmark, m; repeat in the order of the columns.")
     ] = None,
     table_out: Annotated[
-        Path | None, typer.Option(metavar="TABLE", help="Write TABLE with the names and units that the model reads.")
+        Path | None, typer.Option(metavar="TABLE", help="Table to write, with the model's names and units.")
     ] = None,
     force: Annotated[bool, typer.Option("--force", help="Overwrite existing files.")] = False,
 ) -> None:
     """Write a model from parts: vehicle, controls, sensors.
 
-    With a TABLE, its columns say which, as far as their names do; flags say the rest. At a terminal it asks.
+    The columns of TABLE select them; options set the rest. At a terminal it asks.
     """
     from steady_ppl.runs.table_header import Header
     from steady_ppl.runs.vehicle_parts import needs_landmarks, sensor_kinds, write_model

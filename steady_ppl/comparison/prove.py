@@ -219,7 +219,7 @@ def _blown_up(rows: Mapping[str, ProgramScores]) -> list[str]:
     notes = []
     for name, row in rows.items():
         if horizons := [key.horizon for key, sums in row.sums.items() if not np.isfinite(sums.total).all()]:
-            notes.append(f"{name} blows up {min(horizons)} rows ahead")
+            notes.append(f"{name} diverges {min(horizons)} rows ahead")
     return notes
 
 

@@ -186,7 +186,7 @@ def judge_constant_velocity(before: Judged) -> Judged | str:
     path = before.tracked.path(unseen.data)
     ahead = smooth(replace(unseen, program=found.program), replace(path, noise=torch.zeros_like(path.noise)))
     if bool(ahead.is_broken.any()):
-        return "it blows up on these drives"
+        return "it diverges on these drives"
     return compare_predictions(replace(before.problem, program=found.program), ahead, before.horizons)
 
 
@@ -202,7 +202,7 @@ def noise_floor(true: Judged, seed: int) -> Judged | str:
     own = replace(unseen, data=again)
     ahead = smooth(own, path)
     if bool(ahead.is_broken.any()):
-        return "the true program does not explain drives of its own"
+        return "the true program does not fit drives of its own"
     if true.states:
         own = replace(own, data=replace(again, states=torch.where(again.rows.unsqueeze(-1), path.states, torch.nan)))
     return compare_predictions(own, ahead, true.horizons)

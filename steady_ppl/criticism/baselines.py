@@ -108,7 +108,7 @@ def constant_velocity(problem: Problem, tracked: Tracked, horizons: Sequence[int
         if math.isfinite(likely) and (best is None or likely > best[0]):
             best = likely, coasting, found
     if best is None:
-        return "it blows up on these drives"
+        return "it diverges on these drives"
     likely, coasting, found = best
     return Reference(coasting, likely, predict(coasting, data, found, horizons))
 

@@ -25,12 +25,12 @@ from steady_ppl.utils.text import aligned, figure, with_unit
 MAX_FINDINGS_SHOWN = 8  # findings in the table
 MIN_GAIN_OF_FIT = 1.0  # nats that a longer fit must gain to be what is advised first
 VERDICTS = {  # the verdict; and what stands out as well, which is no verdict while the parameters are wrong
-    "sensor": ("the sensor is at fault", "the sensor stands out"),
-    "actuator": ("the actuators are at fault", "the actuators stand out"),
-    "dynamics": ("the dynamics are at fault", "the dynamics stand out"),
-    "noise": ("its noise is at fault", "its noise stands out"),
-    "parameters": ("its own parameters do not suit these drives", ""),
-    "cannot tell": ("these drives cannot tell what is at fault", ""),
+    "sensor": ("the sensor model is wrong", "the sensor model stands out"),
+    "actuator": ("the actuator model is wrong", "the actuator model stands out"),
+    "dynamics": ("the dynamics are wrong", "the dynamics stand out"),
+    "noise": ("the noise is wrong", "the noise stands out"),
+    "parameters": ("the parameters are wrong", ""),
+    "cannot tell": ("these drives cannot tell which part is wrong", ""),
 }
 
 
@@ -49,7 +49,7 @@ class Check(Displayed):
         held: horizon → measured less last measured, and where both exist.
         step: the program beside itself at finer steps, refitted to these drives.
         misfit: the maps; every cell with its residual.
-        blame: who is at fault.
+        blame: which part is wrong.
         residuals: names of the measurement components and, after them, of the channels.
         standardised: the residuals themselves, one set, with the variables that the regimes are ranges of.
         stuck: stretches of the table in which nothing was measured though something is written.
@@ -246,18 +246,18 @@ def verdict(found: Check) -> str:
         said += f" ({alone} of {len(found.misfit.cells)} cells would stand out by themselves)" if alone else ""
         said += "; `steady discover` says what could not have been seen"
     else:
-        said = "The program does not explain these drives: "
+        said = "The program does not fit these drives: "
         if blame.p_values["parameters"] <= blame.level:
             (fault, _), (_, beside) = VERDICTS["parameters"], VERDICTS[blame.kind]
             said += f"{fault}{_parameters(blame)}{_of_fit(found.information)}"
             said += f"; beside them {beside}{_most_clearly(blame)}" if beside else ""
-            said += f"; {discover}" if _is_done(found.information) else f"; if that changes little, {discover}"
+            said += f"; {discover}" if _is_done(found.information) else f"; otherwise {discover}"
         else:
-            of_noise = "the effects of kind noise in `steady discover` say in which way"
+            of_noise = "the effects of kind noise in `steady discover` say how"
             next_command = of_noise if blame.kind == "noise" else discover
             said += f"{VERDICTS[blame.kind][0]}{_most_clearly(blame)}; {next_command}"
     if loses := lost_horizons(found):
-        said += f"; it predicts worse than a vehicle that just keeps its velocity ({', '.join(loses)} ahead)"
+        said += f"; it predicts worse than constant velocity ({', '.join(loses)} ahead)"
     return f"{first}{said}."
 
 
@@ -272,8 +272,8 @@ def _of_fit(fitted: ParameterInformation | None) -> str:
     if fitted is None:
         return f": {again}"
     if _is_done(fitted):
-        return ", though its fit has ended: either these drives are of another vehicle, or it lacks what is no number"
-    return f", and its fit had not ended (a longer one gains {fitted.gain:.2g} nats, linearised): {again}"
+        return ", although the fit has converged: these drives are of another vehicle, or an effect is missing"
+    return f", and the fit has not converged (a longer one gains {fitted.gain:.2g} nats, linearised): {again}"
 
 
 def _most_clearly(blame: Attribution) -> str:
@@ -283,7 +283,7 @@ def _most_clearly(blame: Attribution) -> str:
     if blame.kind == "cannot tell":
         close = sorted(blame.explained, key=lambda kind: -blame.explained[kind])[:2]
         alike = len(close) == 2 and min(blame.explained[kind] for kind in close) > 3
-        return f" ({close[0]} and {close[1]} explain them nearly alike)" if alike else ""
+        return f" ({close[0]} and {close[1]} fit them nearly alike)" if alike else ""
     _, name, z = blame.evidence[0]
     return f", most clearly the {name} (score {z:+.1f} standard deviations)"
 
@@ -292,7 +292,7 @@ def _parameters(blame: Attribution) -> str:
     """The parameter that explains most alone, and those that explain nearly as much."""
     order = sorted(blame.parameters.items(), key=lambda item: -abs(item[1]))
     least = order[0][1] ** 2 - 2 * MIN_GAIN_OF_KIND * max(1.0, blame.dispersion)
-    alike = [f"{name} ({'more' if z > 0 else 'less'} is asked for)" for name, z in order if z**2 >= least]
+    alike = [f"{name} ({'larger' if z > 0 else 'smaller'} fits better)" for name, z in order if z**2 >= least]
     return f", most clearly {' or '.join(alike)}"
 
 

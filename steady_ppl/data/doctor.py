@@ -186,5 +186,5 @@ def _frozen(data: Trajectories, table: Columns) -> Iterator[Suspicion]:
         begin, end = there[0].seconds
         why = f"{cells} cells lie on straight lines, first from {begin:.2f} to {end:.2f} s"
         why += ": the sensor hung, or gaps were interpolated"
-        mend = "steady check RUN TABLE --mask CLEAN.csv leaves out what nobody measured"
+        mend = "steady check RUN TABLE --mask CLEAN.csv leaves out unmeasured stretches"
         yield Suspicion("frozen", column, tuple(dict.fromkeys(one.label for one in there)), cells, why, mend)

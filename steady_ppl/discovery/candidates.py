@@ -174,7 +174,7 @@ def screen_program(
     columns = [column for column, scores in zip(columns, found, strict=True) if not isinstance(scores, str)]
     observed = torch.cat([own, *(scores for scores in found if not isinstance(scores, str))], -1)
     if broken := (~torch.isfinite(own).all(-1)).nonzero().flatten().tolist():
-        raise FilterError(f"trajectory {fold.drives.labels[broken[0]]}: the fitted program blows up on it")
+        raise FilterError(f"trajectory {fold.drives.labels[broken[0]]}: the fitted program diverges on it")
     starts = fold.path.states[0].expand(sets, -1, -1)  # known, or draws of their posterior
     if not fold.known_start:
         with seeded(seed, "starts"):

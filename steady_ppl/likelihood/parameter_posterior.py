@@ -199,7 +199,7 @@ def log_likelihood_along(problem: Problem, path: ReferencePath) -> LogLikelihood
 
 
 def log_posterior(program: Program, values: Tensor, judge: LogLikelihood) -> Tensor:
-    """log p(y) and log prior of values `(K, P)`, `(K,)`: minus infinity where the program blows up.
+    """log p(y) and log prior of values `(K, P)`, `(K,)`: minus infinity where the program diverges.
 
     Raises:
         FilterError: it does at all of them.

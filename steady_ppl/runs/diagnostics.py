@@ -16,13 +16,10 @@ from steady_ppl.runs.fit import Fit
 LOG_RATIO_TO_ZERO = math.log(20.0)  # log ratio by which a positive number falls to next to nothing
 LOG_RATIO_OF_GUESS = math.log(1e3)  # the same of a guess, such as noise
 HIDDEN = (
-    "as the program stands, these drives see next to nothing of it; an effect that is missing may hide it (`steady "
+    "these drives hardly depend on it as the program stands; a missing effect may hide it (`steady "
     "discover`), or commands are swapped, or a heading counts the other way"
 )
-COLLAPSED = (
-    "something else in the program explains too much; set it back in the program's file and fit again before anything "
-    "is tested"
-)
+COLLAPSED = "another part of the program takes its place; reset it in the program's file and fit again before any test"
 
 
 def diagnose_fit(fit: Fit, declared: Mapping[str, Tensor]) -> list[str]:

@@ -155,10 +155,10 @@ def require_same(folder: Path, begun: Mapping[str, Any]) -> None:
     inputs = {"program": "program", "table_sha256": "training table", "valid_sha256": "--valid table"}
     for key, what in inputs.items():
         if before.get(key) != begun[key]:
-            raise RunError(f"{folder}: --resume goes on with the same {what}, but it is another or has changed since")
+            raise RunError(f"{folder}: --resume needs the same {what}; it is another or has changed")
     if before.get("option_files") != begun["option_files"]:
         same = " and ".join(begun["option_files"])
-        raise RunError(f"{folder}: --resume goes on with the same {same}; a file has changed")
+        raise RunError(f"{folder}: --resume needs the same {same}; a file has changed")
     for key in ("recipe", "known_start", "seed", "options", "begun_substeps"):
         if before.get(key) != begun[key]:
             name, then = key.removeprefix("begun_"), before.get(key)

@@ -77,7 +77,7 @@ def simulate(
         path = torch.cat(states)
         for row, drive in (~path.isfinite().all(-1) & run.rows).nonzero()[:1].tolist():
             where = f"trajectory {run.labels[drive]}, row {row + 1}"
-            what = f"program {type(program).__name__} blows up: in {where}, its states are not finite"
+            what = f"program {type(program).__name__} diverges: in {where}, its states are not finite"
             raise ProgramError(what, site="transition")
         measurements = measure(program, path)
     return replace(

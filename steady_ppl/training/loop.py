@@ -231,15 +231,15 @@ def _in_words(figures: Mapping[str, float], steps: int = 0) -> str:
 
 def _require_finite_gradient(name: str, value: Tensor, step: int) -> None:
     if value.grad is not None and not bool(torch.isfinite(value.grad).all()):
-        how = "look for a square root, a division or a norm at zero in the program, or for roll-outs that blow up"
+        how = "look for a square root, a division or a norm at zero in the program, or for roll-outs that diverge"
         raise TrainingError(f"the gradient of {parameter_name(name)} is not finite at step {step + 1}: {how}")
 
 
 def _judge(state: Checkpoint, held_out: list[float], figures: dict[str, float]) -> None:
     """Note a validation, and keep the averaged parameters if they are as good as the best."""
     if state.best_held_out and len(state.best_held_out) != len(held_out):
-        knows = f"it knows {len(state.best_held_out)} held-out log p(y), and there are {len(held_out)}"
-        raise RunError(f"the checkpoint is damaged: {knows}")
+        counts = f"it has {len(state.best_held_out)} held-out log p(y), and there are {len(held_out)}"
+        raise RunError(f"the checkpoint is damaged: {counts}")
     entry = {"step": float(state.step), **figures}
     if held_out:
         entry["log_likelihood"] = sum(held_out) / len(held_out)

@@ -61,7 +61,7 @@ def test_a_stretch_that_nobody_measured_is_named_and_masked(work: Path, tmp_path
     assert steady("check", work / "hand", table, *FAST, "--mask", kept, "--json", figures) == 0
     said = capsys.readouterr()
     assert "the table: drive 2 between 1.00 and 2.50 s: x.x, x.y on a straight line" in said.out
-    assert f"{kept}: gap.csv without 1 stretch that nobody measured and 0 wrong readings" in said.err
+    assert f"{kept}: gap.csv without 1 unmeasured stretch and 0 wrong readings" in said.err
     (one,) = json.loads(figures.read_text())["stuck"]
     assert one["trajectory"] == "2" and one["seconds"] == pytest.approx([1.0, 2.5])
     again = read_table(kept)
@@ -80,7 +80,7 @@ def test_wrong_readings_are_named_marked_and_masked(work: Path, tmp_path: Path, 
     said = capsys.readouterr()
     assert "3 readings left out as wrong" in said.out
     assert "trajectory 2 between 1.00 and 1.20 s: y.bearing_2" in said.out
-    assert f"{kept}: jump.csv without 0 stretches that nobody measured and 3 wrong readings" in said.err
+    assert f"{kept}: jump.csv without 0 unmeasured stretches and 3 wrong readings" in said.err
     (one,) = json.loads(figures.read_text())["outliers"]
     assert (one["trajectory"], one["columns"]) == ("2", ["y.bearing_2"]) and picture.stat().st_size > 10_000
     again = read_table(kept)

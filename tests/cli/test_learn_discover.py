@@ -208,7 +208,7 @@ def test_an_interrupted_search_shows_what_it_found_and_ends_as_it_would_have(
     said = capsys.readouterr()
     assert said.out.startswith("warning: interrupted while testing and fitting effects")
     assert "The dynamics lack yaw_bias = 0." in said.out and "there may be more" in said.out
-    assert f"`--resume` goes on with {run}" in said.err
+    assert f"`--resume` continues {run}" in said.err
     content = json.loads(figures.read_text())
     assert content["interrupted"] and not content["complete"] and content["before"] is None
     assert content["effects"][0]["coefficient"] == pytest.approx(whole["effects"][0]["coefficient"])
@@ -240,7 +240,7 @@ def test_an_interrupt_before_the_first_tests_is_said_in_a_line(table, whole, tmp
     assert steady("discover", MODEL, table, *FEW, "--out", run, "-q") == 1
     said = capsys.readouterr()
     assert said.out == "" and len(said.err.splitlines()) == 1
-    assert "no effect has been tested yet" in said.err and f"`--resume` goes on with {run}" in said.err
+    assert "no effect has been tested yet" in said.err and f"`--resume` continues {run}" in said.err
     assert steady("discover", MODEL, table, *FEW, "--out", run, "--resume") == 0
     assert json.loads((run / "discovery.json").read_text()) == whole
     capsys.readouterr()
@@ -256,7 +256,7 @@ def test_a_second_interrupt_ends_at_once_and_leaves_the_journal(table, tmp_path,
     monkeypatch.setattr(discover, "findings", interrupted_at(1, discover.findings))
     assert steady("discover", MODEL, table, *FEW, "--out", run, "-q") == 1
     said = capsys.readouterr()
-    assert said.out == "" and said.err == f"steady: interrupted; `--resume` goes on with {run}\n"
+    assert said.out == "" and said.err == f"steady: interrupted; `--resume` continues {run}\n"
     assert any((run / "journal").iterdir())
 
 

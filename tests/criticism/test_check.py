@@ -318,7 +318,7 @@ def test_a_spring_that_is_too_soft_is_a_parameter_and_what_could_stand_for_it_is
     data = table(program, trajectories=8, rows=101)
     program.stiffness = torch.tensor(9.0)
     figures = st.check(fitted(program), data, simulations=40).figures
-    assert figures["who"] == "parameters" and "stiffness (more is asked for)" in figures["verdict"]
+    assert figures["who"] == "parameters" and "stiffness (larger fits better)" in figures["verdict"]
 
 
 def test_what_cannot_be_checked_is_refused(cart, even):
@@ -396,9 +396,9 @@ def test_numbers_that_lead_anywhere_are_taken_as_exact(off) -> None:
     [
         (
             0.01,
-            "though its fit has ended: either these drives are of another vehicle, or it lacks what is no number;",
+            "although the fit has converged: these drives are of another vehicle, or an effect is missing;",
         ),
-        (7.0, "and its fit had not ended (a longer one gains 7 nats, linearised): fit it again first"),
+        (7.0, "and the fit has not converged (a longer one gains 7 nats, linearised): fit it again first"),
     ],
 )
 def test_a_fit_that_has_ended_is_not_sent_back(off, gain: float, says: str) -> None:

@@ -112,7 +112,7 @@ def test_a_hand_that_changed_is_not_resumed_with(tmp_path, capsys) -> None:
     assert steady(*command) == 0
     hand.write_text(hand.read_text().replace("1.5", "1.6"))
     assert steady(*command, "--resume") == 2
-    assert "goes on with the same hand" in capsys.readouterr().err
+    assert "needs the same hand" in capsys.readouterr().err
 
 
 def test_fit_hand_by_command(tmp_path, capsys) -> None:

@@ -76,5 +76,5 @@ def test_no_trajectories_are_refused() -> None:
 
 
 def test_a_program_that_blows_up_is_said_to():
-    with pytest.raises(ProgramError, match="WithLinearDrag blows up: in trajectory 1, row [0-9]+, its"):
+    with pytest.raises(ProgramError, match="WithLinearDrag diverges: in trajectory 1, row [0-9]+, its"):
         simulate(example("hovercraft").with_effect("linear_drag", 1e15), 1)

@@ -173,7 +173,7 @@ def actuator_lag(self: Program, control: Tensor, time: Tensor, c: Tensor, contro
     r"""du_acting/dt = (u - u_acting) / c
 
     equation: \dot u_\mathrm{acting} = (u - u_\mathrm{acting}) / c
-    feels: builds up what it is told, and lets go of it as slowly
+    feels: follows a command slowly, up and down
     occurs: rotors that spin up, hydraulic cylinders, heating elements, a low pass in the driver
     """
     return control + self.chosen_controls(controls, control) * (lagged(control, time, c) - control)
@@ -184,7 +184,7 @@ def actuator_delay(self: Program, control: Tensor, time: Tensor, c: Tensor, cont
     r"""u_acting(t) = u(t - c)
 
     equation: u_\mathrm{acting}(t) = u(t - c)
-    feels: does all that it is told, later
+    feels: follows every command, later
     occurs: radio links, buses and computers between command and motor
     """
     return control + self.chosen_controls(controls, control) * (delayed(control, time, c) - control)

@@ -293,7 +293,7 @@ def lateral_coupling(self: Program, state: Tensor, control: Tensor, *_: Tensor, 
     r"""a_lateral = c (left - right)
 
     equation: a_\mathrm{lateral} = c\,(u_\mathrm{left} - u_\mathrm{right})
-    feels: steps sideways when it is told to turn
+    feels: moves sideways when it is steered
     occurs: propellers whose wash hits a skeg, a stern that swings, the paddle-wheel effect of a single screw
     """
     left, right = (control[..., self.control_index(name)] for name in controls_of(self, "left", "right"))
@@ -330,7 +330,7 @@ def added_mass(self: Program, state: Tensor, *_: Tensor, c: Tensor) -> Pushes:
     r"""a_forward = c v_y ω
 
     equation: a_\mathrm{forward} = c\,v_y\,\omega
-    feels: loses speed in turns in which it slides outwards, and more than drag explains
+    feels: loses more speed than by drag in turns in which it slides outwards
     occurs: hulls and airships, which carry more water or air along sideways than ahead (the v r term of Fossen 2011,
         chapter 6)
     """
@@ -391,7 +391,7 @@ def acceleration_limit(self: Program, state: Tensor, *_: Tensor, c: Tensor, chan
     r"""a → a / (1 + |a/c|⁴)^¼, so that |a| ≤ c
 
     equation: a \to a\,(1 + |a / c|^4)^{-1/4}
-    feels: never jumps off the line, whatever it is told
+    feels: never jumps off the line, whatever the command
     occurs: motor drivers with a ramp or a current limit, tyres at the limit of grip
     """
     return {channel: _limited(mean[channel], c) - mean[channel] for channel in channels}

@@ -82,7 +82,7 @@ def response_time(
     r"""dv/dt = (v_told - v) / (c + τ), τ what the program has (its step where it says nothing)
 
     equation: \dot v = (v_\mathrm{told} - v) / (c + \tau)
-    feels: gets to what it is told, or back to it when pushed off, little by little
+    feels: reaches its command, or returns to it when pushed off, little by little
     occurs: speed controllers with little gain, hydraulic steering, heavy wheels
     """
     slower, carried = c / (c + self.settles_in(step)), self.carried(state)
