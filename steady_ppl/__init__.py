@@ -1,4 +1,4 @@
-"""Learn how a vehicle moves from noisy, indirect measurements, with its state-space model written as a Pyro program.
+"""Learn vehicle dynamics from noisy, indirect measurements, with a state-space model written as a Pyro program.
 
 `__init__.pyi` lists the public names. Each is imported when it is first used, so that `steady --help` loads no torch.
 """

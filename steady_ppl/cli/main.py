@@ -167,7 +167,7 @@ def options(
         bool, typer.Option("--version", callback=say_version, is_eager=True, hidden=True, help="Show the version.")
     ] = False,
 ) -> None:
-    """Learn how a vehicle moves from noisy measurements. To see it: steady demo"""
+    """Learn vehicle dynamics from noisy measurements. To see it: steady demo"""
 
 
 def main(arguments: list[str] | None = None) -> int:

@@ -1,8 +1,10 @@
 """The public namespace."""
 
 import ast
+import re
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 
 import pytest
@@ -38,3 +40,17 @@ def test_importing_the_package_loads_no_torch() -> None:
 
 def test_the_root_says_what_lower_packages_call_of_higher_ones() -> None:
     assert context.__annotations__.keys() <= vars(context).keys() and context.html is not repr
+
+
+def test_the_citation_is_of_this_version() -> None:
+    root = Path(__file__).parents[2]
+    project = tomllib.loads((root / "pyproject.toml").read_text())["project"]
+    given = dict(re.findall(r"^(\w+): (.+)$", (root / "CITATION.cff").read_text(), re.MULTILINE))
+    assert (given["version"], given["title"], given["license"]) == (
+        project["version"],
+        project["name"],
+        project["license"],
+    )
+    assert given["abstract"] == f"{project['description']}."
+    assert f"## {project['version']}" in (root / "CHANGELOG.md").read_text()
+    assert (STUB.parent / "py.typed").is_file()
