@@ -1,6 +1,6 @@
 // Tables, formulas and code that scroll can be reached by keyboard; the theme's copy buttons are no landmarks of their own.
 const mend = () => {
-  for (const wrap of document.querySelectorAll(".md-typeset__scrollwrap, pre > code, :is(p, li):has(> math)")) {
+  for (const wrap of document.querySelectorAll(".md-typeset__scrollwrap, pre > code, .formula")) {
     if (wrap.scrollWidth > wrap.clientWidth) wrap.tabIndex = 0
     else wrap.removeAttribute("tabindex")
   }

@@ -72,5 +72,9 @@ def _accessible(text: str) -> str:
 
 
 def _formulas(text: str) -> str:
-    text = re.sub(r"\$\$(.+?)\$\$", lambda one: convert(one[1].strip(), display="block"), text, flags=re.DOTALL)
+    text = re.sub(r"\$\$(.+?)\$\$", _block, text, flags=re.DOTALL)
     return re.sub(r"(?<![\w$\\])\$([^$\n]+?)\$(?![\w$])", lambda one: convert(one[1]), text)
+
+
+def _block(formula: re.Match[str]) -> str:
+    return f'<div class="formula">{convert(formula[1].strip(), display="block")}</div>'
