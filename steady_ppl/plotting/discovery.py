@@ -58,7 +58,7 @@ def discovery_picture(found: Discovery) -> Figure:
             above, below = left.subplots(2, 1, height_ratios=(height - 3.5, 3))
             gains(rows, above)
             open_loop_picture(found.proof, axes=below)
-            titled(below, "predictions of the validation drives", below.get_xlabel())
+            titled(below, "prediction error on the validation drives", below.get_xlabel())
         if found.shape:
             unknown_effect(found, axes=right.subplots())
         else:
@@ -81,7 +81,7 @@ def gains(rows: Sequence[GainRow], axes: Axes) -> None:
         elif row.label:
             _point(axes, row, place, hollow=row.interval is None)
     about = "held-out log p(y) gained [nats], 95 % interval"
-    titled(axes, "what each candidate brings", about, [row.label or row.beside for row in rows])
+    titled(axes, "held-out gain of each candidate", about, [row.label or row.beside for row in rows])
     for text, row in zip(axes.get_yticklabels(), rows, strict=True):
         text.set_fontweight("normal" if row.label else "bold")
     axes.set_xlim(left - 0.05 * (most - left), None)
@@ -90,7 +90,7 @@ def gains(rows: Sequence[GainRow], axes: Axes) -> None:
     for color in [color for color in kinds if any(row.label and row.color == color for row in rows)]:
         axes.plot([], [], "o", color=color, ms=5, label=kinds[color])
     if any(row.label and row.interval is None and row.value >= left for row in rows):
-        axes.plot([], [], "o", mfc="none", color=OTHER_COLOR, ms=5, label="given up after half the drives")
+        axes.plot([], [], "o", mfc="none", color=OTHER_COLOR, ms=5, label="stopped after half of the drives")
     axes.legend(fontsize=7, loc="upper center", bbox_to_anchor=(0.5, -0.12), ncols=3)
 
 
@@ -108,7 +108,7 @@ def coefficients(found: Discovery, axes: Axes, rest: int = MAX_OTHERS) -> None:
         axes.xaxis.set_major_formatter("{x:g}")
         axes.margins(x=0.06)
     axes.text(1.01, 1.01, "limit", transform=axes.transAxes, fontsize=7, va="bottom")
-    title = "what was found and what is left" if found.findings else "what could have been seen"
+    title = "effects found, and effects that remain" if found.findings else "detection limits"
     about = "coefficient / detection limit, 90 % interval (green: can be missed)"
     titled(axes, title, about, [row.label for row in rows])
 

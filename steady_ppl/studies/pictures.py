@@ -52,7 +52,7 @@ def study_picture(plan: Plan, results: pd.DataFrame) -> Figure:
     own = own.iloc[np.argsort([order[key] for key in own["key"]], kind="stable")]
     if picture.chosen_by:
         own = best_settings(picture, own)
-    figure = Figure(figsize=(5.4 * len(picture.y), 5.4), layout="constrained")
+    figure = Figure(figsize=(4.2 * len(picture.y), 4.6), layout="constrained")
     figure.suptitle(printable(plan.title), fontsize=11, parse_math=False)
     lines = _lines(picture, own)
     panels = figure.subplots(1, len(picture.y), squeeze=False, sharex=picture.x == IN_LIMITS)[0]
