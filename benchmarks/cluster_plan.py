@@ -3,7 +3,7 @@
     python benchmarks/cluster_plan.py
 
 Reads results/cluster.json (of `cluster.py`) and results/observation-noise.parquet (of `studies.py`) and writes
-results/cluster.md, the tables of docs/cluster.md. Fits are drawn from those of the noise study, and handed to workers
+results/cluster.md, which docs/cluster.md quotes. Fits are drawn from those of the noise study, and handed to workers
 one after the other as the scheduler does; machines die at random (exponentially), and take what they compute with them.
 """
 

@@ -19,13 +19,13 @@ from steady_ppl.effects import catalogue
 
 ROOT = Path(__file__).parents[2]
 DOCS = ROOT / "docs"
-PAGES = [*sorted(DOCS.glob("*.md")), ROOT / "README.md", ROOT / "CONTRIBUTING.md"]
+PAGES = [*sorted(DOCS.glob("*.md")), *sorted(ROOT.glob("*.md"))]
 RUN = (
     "own-effect",
     "own-recipe",
     "import-log",
-    *(pytest.param(name, marks=pytest.mark.slow) for name in ("cli", "own-data", "own-sensor", "control")),
-    pytest.param("own-program", marks=pytest.mark.exhaustive),
+    *(pytest.param(name, marks=pytest.mark.slow) for name in ("cli", "own-data", "own-sensor", "control", "vehicles")),
+    *(pytest.param(name, marks=pytest.mark.exhaustive) for name in ("own-program", "time-steps", "start-prior")),
 )
 
 

@@ -10,30 +10,11 @@ import pytest
 
 ROOT = Path(__file__).parents[2]
 README = ROOT / "README.md"
-NAMES = (
-    "architecture",
-    "cli",
-    "comparison",
-    "demo",
-    "discovery",
-    "discovery-first",
-    "discovery-fits",
-    "discovery-limits",
-    "discovery-results",
-    "discovery-verdict",
-    "guides",
-    "kernels",
-    "limitations",
-    "mathematics",
-    "methods",
-    "promises",
-    "real-logs",
-    "results-guides",
-    "results-paper",
-    "results-speed",
-    "truck",
-)
-PAGES = [README, *(ROOT / "docs" / f"{name}.md" for name in NAMES)]
+NOT_YET = ("gallery", "reference")  # written from docstrings
+PAGES = [
+    *sorted(ROOT.glob("*.md")),
+    *(page for page in sorted((ROOT / "docs").glob("*.md")) if page.stem not in NOT_YET),
+]
 UNWANTED = re.compile(
     r"\b(believ\w*|accus\w*|innocent|swallow\w*|guilty|(?:model|program|particle|score)s? (?:explains?|knows?)"
     r"|looks? ahead|blows? up|yardsticks?|rivals?|hostile|begun|gone on with|falls? short)\b",

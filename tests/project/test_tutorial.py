@@ -1,8 +1,9 @@
-"""The tutorial, typed from its first line to its last on somebody's log of a boat."""
+"""The tutorial, typed from its first line to its last: on a log of one's own with other names, and on its own log."""
 
 from __future__ import annotations
 
 import re
+import shlex
 import shutil
 import subprocess
 import sys
@@ -20,16 +21,16 @@ COLUMNS |= {"y.gps_x": "gps_x", "y.gps_y": "gps_y", "y.compass": "compass"}
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    """A log with a column that nobody asked for, and the owner's program: the second class is deleted, as is said."""
+    """A log with names of its own and a column that nobody asked for, beside the models."""
     log = st.to_frame(st.simulate(example("gps_boat.py:GpsBoatTruth"), 18, seed=1))
     log[list(COLUMNS)].rename(columns=COLUMNS).assign(note="windy").to_csv(tmp_path / "log.csv", index=False)
-    source = (MODELS / "gps_boat.py").read_text()
-    (tmp_path / "mine.py").write_text(source[: source.index("class GpsBoatTruth")])
+    (tmp_path / "models").symlink_to(MODELS)
     return tmp_path
 
 
-def blocks(language: str) -> list[str]:
-    return re.findall(rf"^```{language}\n(.*?)^```", TUTORIAL.read_text(), re.MULTILINE | re.DOTALL)
+def blocks() -> list[tuple[str, str]]:
+    """Languages and texts, in their order."""
+    return re.findall(r"^```(sh|python)\n(.*?)^```", TUTORIAL.read_text(), re.MULTILINE | re.DOTALL)
 
 
 def typed(folder: Path, command: list[str]) -> str:
@@ -40,7 +41,7 @@ def typed(folder: Path, command: list[str]) -> str:
 
 @pytest.mark.slow
 def test_a_log_becomes_three_tables(folder: Path) -> None:
-    (script,) = blocks("python")
+    (script,) = [text for language, text in blocks() if language == "python"]
     typed(folder, [sys.executable, "-c", script])
     tables = {name: st.read_table(folder / f"{name}.csv") for name in ("train", "valid", "test")}
     assert [len(table) for table in tables.values()] == [6, 5, 7]
@@ -49,13 +50,19 @@ def test_a_log_becomes_three_tables(folder: Path) -> None:
 
 @pytest.mark.exhaustive
 def test_it_ends_with_a_program_that_predicts_better_and_a_page(folder: Path) -> None:
-    typed(folder, [sys.executable, "-c", blocks("python")[0]])
     steady = shutil.which("steady", path=str(Path(sys.executable).parent))
     assert steady is not None
     said = {}
-    for line in "".join(blocks("sh")).splitlines():
-        words = line.split()
-        said[" ".join(words[1:3])] = typed(folder, [steady, *words[1:]])
+    for language, text in blocks():
+        if language == "python":
+            typed(folder, [sys.executable, "-c", text])
+            continue
+        for line in text.splitlines():
+            name, *words = shlex.split(line)
+            if name == "sed":
+                (folder / "mine.py").write_text(typed(folder, [name, *words[:2]]))
+            else:
+                said[" ".join(words[:2])] = typed(folder, [steady, *words])
     assert "does not fit these drives" in said["check runs/before"]
     assert "lack yaw_linear_drag" in said["discover runs/before"]
     assert "class " in (folder / "mine_after.py").read_text()
