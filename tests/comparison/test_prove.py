@@ -82,6 +82,7 @@ def test_the_vehicle_that_keeps_its_velocity_loses(drag):
     assert against["state"]["location"]["1 s"]["relative_interval"][0] > 0
 
 
+@pytest.mark.slow
 def test_a_reading_that_both_find_wrong_is_left_out_of_every_figure(drag, dragged, truth):
     row, drive = 30, 4
     spoiled = replace(dragged, measurements=dragged.measurements.clone())

@@ -60,6 +60,7 @@ class Wheel(st.Program):
         pyro.sample("height", dist.Normal(state.sin(), 0.1).to_event(1))
 
 
+@pytest.mark.slow
 def test_of_several_starts_the_likeliest_is_kept():
     """Slow waves fit a fast one in many places, each better than its neighbours."""
     table = st.simulate(Wheel(2.2), 2, seed=3)

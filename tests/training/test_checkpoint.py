@@ -72,5 +72,5 @@ def test_resuming_needs_a_checkpoint_of_the_same_program(data, tmp_path):
 
 
 def test_a_checkpoint_of_other_validation_drives_is_refused():
-    with pytest.raises(RunError, match=r"it knows 2 held-out log p\(y\), and there are 1"):
+    with pytest.raises(RunError, match=r"it has 2 held-out log p\(y\), and there are 1"):
         _judge(Checkpoint({}, {}, {}, step=4, best_held_out=[1.0, 2.0]), [1.5], {})
