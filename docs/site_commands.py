@@ -1,19 +1,46 @@
-"""Every command with its arguments and options as Markdown, from the commands themselves."""
+"""Every command with its options, and every recipe with its settings, as Markdown: from the code itself."""
 
 from __future__ import annotations
 
+import inspect
+import re
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import typer
 
 from steady_ppl.cli.main import app
+from steady_ppl.runs.recipes import find_recipe
+
+RECIPES = sorted((Path(__file__).parents[1] / "inference").glob("[a-z]*.py"))
+SHARED = ("program", "table", "valid", "known_start", "seed", "run")  # by options of their own, or by Python alone
 
 
 def page() -> str:
-    """Return a section for `steady` itself and one for each command."""
+    """Return a section for `steady` itself, one for each command, and one for each recipe."""
     group = typer.main.get_command(app)
-    return "\n".join(["## Every option", "", *_section("steady", group), *_commands("steady", group)])
+    commands = ["## Every option", "", *_section("steady", group), *_commands("steady", group)]
+    about = "`--set NAME=VALUE` of `steady fit` gives a setting. `--steps` gives `steps`. None leaves it to the recipe."
+    return "\n".join([*commands, "## Every setting of a recipe", "", about, "", *_recipes()])
+
+
+def _recipes() -> Iterator[str]:
+    usual = _meanings(find_recipe("steady"))
+    for file in RECIPES:
+        recipe = find_recipe(str(file))
+        meanings = usual | _meanings(recipe)
+        settings = [one for one in inspect.signature(recipe).parameters.values() if one.name not in SHARED]
+        rows = [f"| `{one.name}` | {one.default} | {meanings[one.name]} |" for one in settings]
+        head = ["| setting | default | meaning |", "|---|---|---|"] if rows else ["It has none."]
+        yield from (f"### `--recipe {file.stem.replace('_', '-')}`", "", *head, *rows, "")
+
+
+def _meanings(recipe: Any) -> dict[str, str]:
+    """What the section of arguments in a docstring says of each, several of which may share a line."""
+    _, _, after = (inspect.getdoc(recipe) or "").partition("Args:\n")
+    listed = re.findall(r"^    (\w[\w, ]*): (.+?)(?=^    \w|^\w|\Z)", after.partition("\n\n")[0] + "\n", re.M | re.S)
+    return {name: " ".join(meaning.split()) for names, meaning in listed for name in names.split(", ")}
 
 
 def _commands(name: str, group: Any) -> Iterator[str]:

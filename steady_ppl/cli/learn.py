@@ -43,7 +43,7 @@ def fit(
     substeps: common.Substeps = None,
     particles: Annotated[int | None, common.count("Particles for each drive.")] = None,
     draws: Annotated[int | None, common.count("Paths for each drive in the M step.")] = None,
-    steps: Annotated[int | None, common.count("E steps.")] = None,
+    steps: Annotated[int | None, common.count("Steps of the recipe, see its settings.")] = None,
     setting: Annotated[
         list[str] | None,
         typer.Option("--set", metavar="NAME=VALUE", help="Another setting of the recipe, for example ramp=0.7."),

@@ -48,7 +48,8 @@ def commands(name: str, group: Any) -> dict[str, Any]:
 
 
 def test_the_site_lists_every_option_with_its_help() -> None:
-    sections = dict(re.findall(r"^### `(.+?)`\n(.*?)(?=^### |\Z)", loaded("site_commands").page(), re.M | re.S))
+    text, _, _ = loaded("site_commands").page().partition("## Every setting of a recipe")
+    sections = dict(re.findall(r"^### `(.+?)`\n(.*?)(?=^### |\Z)", text, re.M | re.S))
     group = typer.main.get_command(app)
     expected = {"steady": group} | commands("steady", group)
     assert sections.keys() == expected.keys()
@@ -57,6 +58,19 @@ def test_the_site_lists_every_option_with_its_help() -> None:
         options = [one for parameter in command.params for one in parameter.opts if one.startswith("-")]
         assert [one for one in options if one not in sections[name]] == [], name
         assert sections[name].count("\n| `") == len(command.params)
+
+
+def test_the_site_lists_every_setting_of_a_recipe_with_its_default_and_meaning() -> None:
+    site = loaded("site_commands")
+    _, _, text = site.page().partition("## Every setting of a recipe")
+    sections = dict(re.findall(r"^### `--recipe (.+?)`\n(.*?)(?=^### |\Z)", text, re.M | re.S))
+    assert len(sections) == len(site.RECIPES) > 5
+    for name, section in sections.items():
+        settings = inspect.signature(recipes.find_recipe(name)).parameters.values()
+        expected = [(one.name, str(one.default)) for one in settings if one.name not in site.SHARED]
+        rows = re.findall(r"^\| `(\w+)` \| (.+?) \| (.+) \|$", section, re.M)
+        assert [row[:2] for row in rows] == expected
+    assert "| `steps` | 25 | scoring steps at most. |" in sections["likelihood"]
 
 
 def test_the_reference_has_every_public_name() -> None:
