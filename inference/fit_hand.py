@@ -39,7 +39,8 @@ def fit(
         known_start: the first row's true state is given.
         hand: the program written by hand, or where it is (`models/hovercraft.py`); of the same states.
         lineages: paths of each drive (the paper: 8 on Hov, 1 on Hov+, 7 on Truck).
-        particles: of the filter that draws them; 200 of the lookahead proposal, 5000 of others when None (the paper: 100 000).
+        particles: of the filter that draws them; when None 200 of the lookahead proposal, 5000 of others (the
+            paper: 100 000).
         steps, learning_rate, weight_decay, averaging, validate_every, validation_particles, patience, run: as in
             `fit_truth`.
 
