@@ -15,7 +15,7 @@ import torch
 from continuous_drives import simulate
 from continuous_effects import Planted
 from continuous_groups import GROUPS, MODELS, WIND_DRAG, Group, both_have, user_program
-from resumable import Record, digest
+from resumable import Record, digest, plain
 
 import steady_ppl
 from steady_ppl import Program, discover
@@ -90,17 +90,6 @@ def said(found: Discovery) -> Record:
         "notes": list(found.notes),
         "doubts": list(found.doubts),
     }
-
-
-def plain(value: Any) -> Any:
-    """Return a value ready for JSON: figures to five digits, None where there is none."""
-    if isinstance(value, Mapping):
-        return {key: plain(inner) for key, inner in value.items()}
-    if isinstance(value, list | tuple):
-        return [plain(inner) for inner in value]
-    if isinstance(value, float):
-        return float(f"{value:.5g}") if math.isfinite(value) else None
-    return value
 
 
 def limits_of(group: str, effect: str = "") -> Record:

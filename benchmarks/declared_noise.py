@@ -26,8 +26,8 @@ import pyro.distributions as dist
 import torch
 from continuous_groups import GROUPS
 from continuous_programs import CartProgram, PendulumProgram
-from continuous_searches import ENGINE, LIMITS, discovered, plain, said, sized
-from resumable import Record, run
+from continuous_searches import ENGINE, LIMITS, discovered, said, sized
+from resumable import Record, plain, run
 
 from steady_ppl import Program, WrappedNormal, load_program
 

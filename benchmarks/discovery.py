@@ -10,7 +10,6 @@ that, with the records that are there.
 from __future__ import annotations
 
 import argparse
-import math
 import time
 from pathlib import Path
 from typing import Any
@@ -18,7 +17,7 @@ from typing import Any
 import torch
 from discovery_scores import rivals_table, scores_table
 from discovery_sets import BenchmarkSet, benchmark_sets, owner, quick, tables
-from resumable import digest, run, stored
+from resumable import digest, plain, run, stored
 
 import steady_ppl
 from steady_ppl import for_program
@@ -112,17 +111,6 @@ def rivals_of(chosen: BenchmarkSet, brute: bool) -> dict[str, Any]:
                     "seconds": round(ranking.seconds, 1),
                 }
     return plain({"stratum": chosen.stratum, "effects": list(chosen.effects), "rivals": found})
-
-
-def plain(value: Any) -> Any:
-    """Ready for JSON: figures to five digits, None where there is none."""
-    if isinstance(value, dict):
-        return {key: plain(inner) for key, inner in value.items()}
-    if isinstance(value, list | tuple):
-        return [plain(inner) for inner in value]
-    if isinstance(value, float):
-        return float(f"{value:.5g}") if math.isfinite(value) else None
-    return value
 
 
 ENGINE = digest(Path(steady_ppl.__file__).parent)

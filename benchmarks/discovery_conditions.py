@@ -15,9 +15,10 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from discovery import plain, run_sets
+from discovery import run_sets
 from discovery_limits import owner, with_effects
 from discovery_scores import made_by, share, uniformity
+from resumable import plain
 
 from steady_ppl import Program, Trajectories, seeded, simulate
 from steady_ppl.discovery.discover import discover

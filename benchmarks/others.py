@@ -258,6 +258,14 @@ def page(records: Sequence[Record], title: str, cases: Iterable[str]) -> str:
     return "\n".join(lines) + "\n"
 
 
+def concluded(records: Sequence[Record], text: str, result: Path | None) -> int:
+    """Print a page, keep it beside a file of records, and return 1 where something is not met."""
+    print(text)
+    if result is not None:
+        result.with_suffix(".md").write_text(text)
+    return int(not all(one["is_met"] for record in records for one in record.get("asked") or [{"is_met": False}]))
+
+
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--cases", type=Path, required=True)
@@ -275,10 +283,7 @@ def main() -> int:
     version = f"{digest(files=[Path(__file__), *sources])} {given.simulations or 'own'} sets"
     records = run(work, jobs, given.results, version=version, workers=given.workers)
     text = page(records, "Other people's data", CASES)
-    print(text)
-    if given.results == RESULT and set(given.only) == set(CASES):
-        RESULT.with_suffix(".md").write_text(text)
-    return int(not all(one["is_met"] for record in records for one in record.get("asked") or [{"is_met": False}]))
+    return concluded(records, text, RESULT if given.results == RESULT and set(given.only) == set(CASES) else None)
 
 
 if __name__ == "__main__":

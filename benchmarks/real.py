@@ -23,7 +23,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 import pyro
 import pyro.distributions as dist
 import torch
-from others import Asked, page
+from others import Asked, concluded, page
 from resumable import Record, digest, run
 from torch import Tensor, tensor
 
@@ -236,16 +236,12 @@ def main() -> int:
     if absent:
         print(f"left out: {folder.name} has no folder {' and none '.join(absent)}", file=sys.stderr)
         return 0
-    models = (ROOT / "models" / "car.py", ROOT / "models" / "unicycle.py", ROOT / "inference" / "likelihood.py")
-    version = digest(Path(steady_ppl.__file__).parent, files=[Path(__file__), *models])
+    version = digest(*(ROOT / place for place in ("steady_ppl", "models", "inference")), files=[Path(__file__)])
     records = run(
         work, {name: (name, str(folder)) for name in given.only}, given.results, version=version, workers=given.workers
     )
     text = page(records, "Two published logs", CASES)
-    print(text)
-    if given.results == RESULT and set(given.only) == set(CASES):
-        RESULT.with_suffix(".md").write_text(text)
-    return int(not all(one["is_met"] for record in records for one in record.get("asked") or [{"is_met": False}]))
+    return concluded(records, text, RESULT if given.results == RESULT and set(given.only) == set(CASES) else None)
 
 
 if __name__ == "__main__":

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 import sys
 import time
 from collections.abc import Callable, Iterable, Mapping
@@ -12,6 +13,17 @@ from pathlib import Path
 from typing import Any
 
 Record = dict[str, Any]
+
+
+def plain(value: Any) -> Any:
+    """Return a value ready for JSON: figures to five digits, None where there is none."""
+    if isinstance(value, Mapping):
+        return {key: plain(inner) for key, inner in value.items()}
+    if isinstance(value, list | tuple):
+        return [plain(inner) for inner in value]
+    if isinstance(value, float):
+        return float(f"{value:.5g}") if math.isfinite(value) else None
+    return value
 
 
 def digest(*rooms: Path, files: Iterable[Path] = ()) -> str:

@@ -25,8 +25,8 @@ import torch
 from continuous_drives import simulate
 from continuous_effects import Planted
 from continuous_groups import GROUPS, user_program
-from continuous_searches import LIMITS, SOURCES, plain, sized
-from resumable import Record, digest, run
+from continuous_searches import LIMITS, SOURCES, sized
+from resumable import Record, digest, plain, run
 from scipy import stats
 
 import steady_ppl

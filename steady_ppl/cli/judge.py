@@ -8,8 +8,9 @@ from typing import Annotated, Any
 import typer
 
 import steady_ppl as st
-from steady_ppl.cli import common
-from steady_ppl.cli.common import load_runs, present, program_from, read_drives, run_labels, runs_and_table, used_before
+from steady_ppl.cli import options
+from steady_ppl.cli.inputs import load_runs, program_from, read_drives, run_labels, runs_and_table, used_before
+from steady_ppl.cli.output import present
 from steady_ppl.errors import UsageError
 from steady_ppl.utils.files import require_picture, require_place, write_picture
 from steady_ppl.utils.text import counted, say, tell
@@ -22,7 +23,7 @@ SIMULATIONS = 100  # sets for the bands of a report
 def doctor(
     table: Annotated[Path, typer.Argument(help="Table, .csv or .parquet.")],
     model: Annotated[str | None, typer.Argument(help="Program: its units and step are used.")] = None,
-    json_file: common.Json = None,
+    json_file: options.Json = None,
 ) -> None:
     """List suspicious cells of a table, each with the line that mends it."""
     require_place(json_file)
@@ -31,18 +32,18 @@ def doctor(
 
 
 def check(
-    run: common.Run,
+    run: options.Run,
     table: Annotated[Path, typer.Argument(help="Drives, preferably not those of the fit.")],
-    json_file: common.Json = None,
+    json_file: options.Json = None,
     picture: Annotated[Path | None, typer.Option(help="Picture to write, for example .png.")] = None,
     mask: Annotated[
         Path | None,
         typer.Option(help="Table to write without outliers and interpolated stretches."),
     ] = None,
-    simulations: Annotated[int, common.count("Simulated sets for the bands.", least=20)] = 100,
-    horizon: common.Horizons = None,
-    program: common.Moved = None,
-    seed: common.Seed = 0,
+    simulations: Annotated[int, options.count("Simulated sets for the bands.", least=20)] = 100,
+    horizon: options.Horizons = None,
+    program: options.Moved = None,
+    seed: options.Seed = 0,
 ) -> None:
     """Compare a run with measurements: where, when and in which regime it fails, and which part is wrong."""
     from steady_ppl.data.frozen_sensors import without_stretches
@@ -71,14 +72,14 @@ def check(
 
 
 def prove(
-    arguments: common.RunsAndTable,
+    arguments: options.RunsAndTable,
     truth: Annotated[str | None, typer.Option(help="Program that simulated the drives, if there is one.")] = None,
     oracle: Annotated[Path | None, typer.Option(help="Run of the true structure, fitted like the others.")] = None,
-    json_file: common.Json = None,
+    json_file: options.Json = None,
     picture: Annotated[Path | None, typer.Option(help="Picture of the errors to write, for example .png.")] = None,
-    horizon: common.Horizons = None,
-    program: Annotated[list[str] | None, common.moved("once for each RUN and the oracle, in order")] = None,
-    seed: common.Seed = 0,
+    horizon: options.Horizons = None,
+    program: Annotated[list[str] | None, options.moved("once for each RUN and the oracle, in order")] = None,
+    seed: options.Seed = 0,
 ) -> None:
     """Compare runs with the first: log p(y), open-loop errors and noise, with paired intervals.
 
@@ -106,15 +107,15 @@ def prove(
 
 def evaluate(
     arguments: Annotated[list[Path], typer.Argument(metavar="RUN... TABLE", help="Run folders, then the table.")],
-    json_file: common.Json = None,
-    particles: Annotated[int | None, common.count("Particles of the filters.", least=2)] = None,
-    rollouts: Annotated[int, common.count("Noisy roll-outs from each true state.")] = 1000,
-    seed: common.Seed = 0,
+    json_file: options.Json = None,
+    particles: Annotated[int | None, options.count("Particles of the filters.", least=2)] = None,
+    rollouts: Annotated[int, options.count("Noisy roll-outs from each true state.")] = 1000,
+    seed: options.Seed = 0,
     surveyed: Annotated[
         str | None,
         typer.Option("--map", help="Program of the same vehicle with the true landmarks, for runs that learn theirs."),
     ] = None,
-    program: Annotated[list[str] | None, common.moved("with several RUNs once for each, in their order")] = None,
+    program: Annotated[list[str] | None, options.moved("with several RUNs once for each, in their order")] = None,
 ) -> None:
     """The paper's errors where true states exist; errors in measurement space always."""
     from steady_ppl.comparison.evaluate import evaluate_all, incomparable, table_of
@@ -152,7 +153,7 @@ def evaluate(
 
 
 def states(
-    run: common.Run,
+    run: options.Run,
     table: Annotated[Path, typer.Argument(help="Drives.")],
     out: Annotated[
         Path,
@@ -160,10 +161,10 @@ def states(
             "--out", help="A table (.csv, .parquet) of medians and 90 % intervals, or all draws for ArviZ (.nc)."
         ),
     ],
-    draws: Annotated[int, common.count("Paths of each drive.")] = 100,
-    particles: Annotated[int | None, common.count("Particles of the filter.")] = None,
-    program: common.Moved = None,
-    seed: common.Seed = 0,
+    draws: Annotated[int, options.count("Paths of each drive.")] = 100,
+    particles: Annotated[int | None, options.count("Particles of the filter.")] = None,
+    program: options.Moved = None,
+    seed: options.Seed = 0,
 ) -> None:
     """Write posterior draws of the states, given all measurements of a drive.
 
@@ -185,17 +186,17 @@ def states(
 
 
 def report(
-    arguments: common.RunsAndTable,
+    arguments: options.RunsAndTable,
     out: Annotated[Path, typer.Option("--out", help="The page to write.")] = Path("report.html"),
     discovery: Annotated[
         Path | None,
         typer.Option(help="Run of `steady discover`, or its --json file, if none of the RUNs has it."),
     ] = None,
     title: Annotated[str | None, typer.Option(help="Title of the page; the runs' names when not given.")] = None,
-    simulations: Annotated[int, common.count("Simulated sets for the bands.", least=20)] = SIMULATIONS,
-    horizon: common.Horizons = None,
-    program: Annotated[list[str] | None, common.moved("once for each RUN, in order")] = None,
-    seed: common.Seed = 0,
+    simulations: Annotated[int, options.count("Simulated sets for the bands.", least=20)] = SIMULATIONS,
+    horizon: options.Horizons = None,
+    program: Annotated[list[str] | None, options.moved("once for each RUN, in order")] = None,
+    seed: options.Seed = 0,
 ) -> None:
     """Write one page of HTML: verdict, measured against predicted, where it fails, what is missing, before and after.
 

@@ -1,19 +1,25 @@
 """`steady fit`, `discover`, `add`, `effects`, `study` and `plot-study`: programs and what they learn."""
 
 import ast
+import signal
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from threading import Event
 from typing import Annotated, Any, Literal
 
 import typer
 
 import steady_ppl as st
-from steady_ppl.cli import common
-from steady_ppl.cli.common import fit_or_program, present, program_from, read_drives, stopped_after, write_json
-from steady_ppl.errors import RunError, UsageError
+from steady_ppl.cli import options
+from steady_ppl.cli.inputs import fit_or_program, program_from, read_drives
+from steady_ppl.cli.output import present, write_json
+from steady_ppl.errors import RunError, UsageError, require
 from steady_ppl.utils.context import QUIET
 from steady_ppl.utils.files import require_picture, require_place, write_picture
 from steady_ppl.utils.text import say, shown, tell
 
+MAX_MINUTES = 1e5  # after which a command ends: ten weeks
 LITERALS = {"true": True, "false": False, "none": None}
 SAID_IN_NOTES = ("degrees",)  # kinds of findings, which a fit says itself
 SAID_BY_DISCOVER = (*SAID_IN_NOTES, "constant")
@@ -23,7 +29,7 @@ GuideName = Literal["lookahead", "gaussian", "bootstrap", "network", "mean-field
 
 def fit(
     context: typer.Context,
-    model: common.Model,
+    model: options.Model,
     table: Annotated[Path, typer.Argument(help="Training drives, .csv or .parquet.")],
     out: Annotated[Path, typer.Option("--out", help="Run folder to write.")],
     valid: Annotated[Path | None, typer.Option(help="Held-out drives: the stopping rule.")] = None,
@@ -40,18 +46,18 @@ def fit(
     ] = None,
     hand: Annotated[str | None, typer.Option(help="The program written by hand, for fit-hand.")] = None,
     known_start: Annotated[bool, typer.Option(help="Give the first row's x. columns as the exact start.")] = False,
-    substeps: common.Substeps = None,
-    particles: Annotated[int | None, common.count("Particles for each drive.")] = None,
-    draws: Annotated[int | None, common.count("Paths for each drive in the M step.")] = None,
-    steps: Annotated[int | None, common.count("Steps of the recipe, see its settings.")] = None,
+    substeps: options.Substeps = None,
+    particles: Annotated[int | None, options.count("Particles for each drive.")] = None,
+    draws: Annotated[int | None, options.count("Paths for each drive in the M step.")] = None,
+    steps: Annotated[int | None, options.count("Steps of the recipe, see its settings.")] = None,
     setting: Annotated[
         list[str] | None,
         typer.Option("--set", metavar="NAME=VALUE", help="Another setting of the recipe, for example ramp=0.7."),
     ] = None,
-    seed: common.Seed = 0,
+    seed: options.Seed = 0,
     device: Annotated[Literal["cpu", "cuda"], typer.Option(help="Where to compute.")] = "cpu",
     resume: Annotated[bool, typer.Option("--resume", help="Continue an interrupted run.")] = False,
-    force: common.Overwrite = False,
+    force: options.Overwrite = False,
 ) -> None:
     """Learn a program's parameters from measurements."""
     from steady_ppl.runs.recipes import run_recipe
@@ -98,8 +104,8 @@ def _settings(pairs: list[str], found: dict[str, Any]) -> dict[str, Any]:
             found[name] = ast.literal_eval(word)
         except (ValueError, SyntaxError):
             found[name] = LITERALS.get(word, word)
-        if isinstance(found[name], int) and abs(found[name]) > common.MAX_COUNT:
-            raise UsageError(f"--set {shown(pair, 60)}: expected a whole number up to {common.MAX_COUNT}")
+        if isinstance(found[name], int) and abs(found[name]) > options.MAX_COUNT:
+            raise UsageError(f"--set {shown(pair, 60)}: expected a whole number up to {options.MAX_COUNT}")
     return found
 
 
@@ -113,12 +119,12 @@ def discover(
         bool | None,
         typer.Option(help="Give the first row's x. columns as the exact start; a RUN's own setting when not given."),
     ] = None,
-    substeps: common.Substeps = None,
+    substeps: options.Substeps = None,
     mix: Annotated[bool, typer.Option("--mix", help="Join both tables and validate on every second drive.")] = False,
     out: Annotated[Path | None, typer.Option("--out", help="Run folder for the improved fit.")] = None,
-    json_file: common.Json = None,
+    json_file: options.Json = None,
     picture: Annotated[Path | None, typer.Option(help="Picture to write, for example .png.")] = None,
-    simulations: Annotated[int, common.count("Simulated sets for the calibration.", least=50)] = 200,
+    simulations: Annotated[int, options.count("Simulated sets for the calibration.", least=50)] = 200,
     withhold: Annotated[
         list[str] | None, typer.Option(metavar="EFFECT", help="Leave an effect out of the search; repeat for several.")
     ] = None,
@@ -131,10 +137,10 @@ def discover(
     minutes: Annotated[
         float | None, typer.Option(help="Minutes after which the search ends with its result so far.", min=0.01)
     ] = None,
-    program: common.MovedOfRun = None,
-    seed: common.Seed = 0,
+    program: options.MovedOfRun = None,
+    seed: options.Seed = 0,
     resume: Annotated[bool, typer.Option("--resume", help="Continue a search that was stopped.")] = False,
-    force: common.Overwrite = False,
+    force: options.Overwrite = False,
 ) -> None:
     """Identify missing effects: none, one or several of the catalogue, or a curve without a name."""
     from steady_ppl.discovery.discover import kept_search
@@ -182,6 +188,30 @@ def discover(
             raise typer.Exit(1)
 
 
+@contextmanager
+def stopped_after(minutes: float | None) -> Iterator[Event]:
+    """Interrupt the block when its time is over, as Ctrl-C does; the event says so."""
+    over = Event()
+    if minutes is None:
+        yield over
+        return
+    require(0 < minutes <= MAX_MINUTES, "--minutes", minutes, f"a time up to {MAX_MINUTES:g}")
+    if not hasattr(signal, "setitimer"):
+        raise UsageError("--minutes: this system has no timers that interrupt; Ctrl-C does the same")
+
+    def stop(*_: object) -> None:
+        over.set()
+        raise KeyboardInterrupt(f"its {minutes:g} min are over")
+
+    before = signal.signal(signal.SIGALRM, stop)
+    signal.setitimer(signal.ITIMER_REAL, 60 * minutes)
+    try:
+        yield over
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0)
+        signal.signal(signal.SIGALRM, before)
+
+
 def add(
     source: Annotated[str, typer.Argument(metavar="RUN|MODEL", help="A run folder, or a program's file.")],
     out: Annotated[Path, typer.Option("--out", metavar="MODEL.py", help="Program to write, beside the old one.")],
@@ -189,7 +219,7 @@ def add(
         list[str] | None,
         typer.Argument(metavar="EFFECT...", help="NAME[:AT][:OPTION=NUMBER][=NUMBER[,NUMBER]], see `steady effects`."),
     ] = None,
-    program: common.MovedOfRun = None,
+    program: options.MovedOfRun = None,
     force: Annotated[bool, typer.Option("--force", help="Overwrite an existing file.")] = False,
 ) -> None:
     """Write a program with physical effects; `fit` it like any other.
@@ -225,7 +255,7 @@ def effects(
 def study(
     plan: Annotated[Path, typer.Argument(metavar="STUDY.toml", help="File of the study.")],
     out: Annotated[Path, typer.Option("--out", help="Folder of the results; an existing one is resumed.")],
-    workers: Annotated[int | None, common.count("Processes of this machine; its cores when not given.")] = None,
+    workers: Annotated[int | None, options.count("Processes of this machine; its cores when not given.")] = None,
     cluster: Annotated[
         str | None, typer.Option(metavar="ADDRESS", help="A Dask scheduler, tcp://HOST:PORT, in place of processes.")
     ] = None,

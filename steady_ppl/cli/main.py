@@ -18,7 +18,7 @@ from typing import Annotated, Any
 import typer
 
 from steady_ppl.cli import demo, judge, learn, make, new
-from steady_ppl.cli.common import as_refusal
+from steady_ppl.cli.output import as_refusal
 from steady_ppl.cli.progress import progress_line
 from steady_ppl.errors import SteadyError, TableWarning
 from steady_ppl.utils.context import COMMAND, QUIET, UNITS_ROW, bound

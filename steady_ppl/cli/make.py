@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 import typer
 
 import steady_ppl as st
-from steady_ppl.cli import common
-from steady_ppl.cli.common import program_from
+from steady_ppl.cli import options
+from steady_ppl.cli.inputs import program_from
 from steady_ppl.errors import UsageError
 from steady_ppl.utils.progress import stages
 from steady_ppl.utils.text import say, tell
@@ -155,12 +155,12 @@ app = typer.Typer(no_args_is_help=True, rich_markup_mode=None)
 @app.command("alpha-truck", epilog="Example:  steady data alpha-truck alpha_truck/train --out train.csv")
 def alpha_truck(
     folder: Annotated[Path, typer.Argument(help="One split: holds vrpn-pose.csv and vesc_drive.csv.")],
-    out: common.Table,
+    out: options.Table,
     sigma_deg: Annotated[float, typer.Option(help="Standard deviation of the simulated bearings, degrees.")] = 5.0,
     centred: Annotated[
         bool, typer.Option("--centred", help="Velocities at each row, not half a row later as the authors have them.")
     ] = False,
-    seed: common.Seed = 0,
+    seed: options.Seed = 0,
 ) -> None:
     """One split of the AlphaTruck logs to a table, resampled as the authors do.
 
@@ -176,7 +176,7 @@ def alpha_truck(
 def cut(
     table: Annotated[Path, typer.Argument(help="Drives.")],
     seconds: Annotated[float, typer.Option(help="Length of a piece, s.")],
-    out: common.Table,
+    out: options.Table,
 ) -> None:
     """Long drives in pieces, `…-1`, `…-2`, … of the drive's name.
 
@@ -199,10 +199,10 @@ def data() -> None:
 
 
 def simulate(
-    model: common.Model,
-    out: common.Table,
-    trajectories: Annotated[int | None, common.count("How many drives, 16 when not given.")] = None,
-    seed: common.Seed = 0,
+    model: options.Model,
+    out: options.Table,
+    trajectories: Annotated[int | None, options.count("How many drives, 16 when not given.")] = None,
+    seed: options.Seed = 0,
     controls: Annotated[Path | None, typer.Option(help="Table whose times, controls and gaps are used.")] = None,
     substeps: Annotated[
         int | None,

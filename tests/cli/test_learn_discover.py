@@ -15,7 +15,7 @@ from small import HOVERCRAFT, simulated, steady, written
 
 import steady_ppl
 from steady_ppl import Fit, for_program, simulate, write_table
-from steady_ppl.cli.common import stopped_after
+from steady_ppl.cli.learn import stopped_after
 from steady_ppl.discovery import candidates, discover, search
 from steady_ppl.errors import FilterError
 

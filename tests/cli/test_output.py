@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import errno
 
-from steady_ppl.cli.common import as_refusal
+from steady_ppl.cli.output import as_refusal
 from steady_ppl.errors import ComputationError, UsageError
 
 
