@@ -43,8 +43,8 @@ def test_the_calibration_is_that_of_its_records_and_the_page_has_its_musts():
     assert musts in PAGE and musts.count("**no**") == missed
 
 
-def test_the_hostile_trials_are_those_of_their_table():
-    *groups, total = rows((RESULTS / "hostile.md").read_text())[2:]
+def test_the_trials_of_the_fuzzer_are_those_of_their_table():
+    *groups, total = rows((RESULTS / "fuzzing.md").read_text())[2:]
     counts = [sum(int(cells[i]) for cells in groups) for i in range(2, 8)]
     most = [max((cells[i] for cells in groups), key=float) for i in (8, 9)]
     assert [*map(str, counts), *most] == total[2:] and counts[4:] == [0, 0]
