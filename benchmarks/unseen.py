@@ -60,6 +60,7 @@ class Setting:
 SETTINGS = (
     Setting("likelihood, 16, others", "likelihood", 16, 32),
     Setting("steady, 16, others", "steady", 16, 32),
+    Setting("likelihood, 6, others", "likelihood", 6, 12, 0.5),
     Setting("likelihood, 8, its own", "likelihood", 8, 0, 0.5),
     Setting("likelihood, 4, its own", "likelihood", 4, 0, 0.5),
     Setting("likelihood, 1, its own", "likelihood", 1, 0, 0.5),

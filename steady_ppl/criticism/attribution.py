@@ -162,9 +162,10 @@ def _together(each: Array) -> tuple[float, float]:
 
 
 def attribute(scores: Scored, parameters: Scored, noise: dict[str, Array], maps: Array) -> Attribution:
-    """Decide who is at fault by the two of `scored`, by mean squares and the like, and by the p-values of the
-    hypothesis that the maps hold nothing, each of the real and every simulated set `(1 + M,)`."""
-    scatter = np.stack([values / values[1:].mean() for name, values in noise.items() if name.startswith(SCATTER)])
+    """Decide who is at fault by the two of `scored`, by logarithms of mean squares and the like, and by the p-values of
+    the hypothesis that the maps hold nothing, each of the real and every simulated set `(1 + M,)`."""
+    squares_of = np.exp(np.stack([values for name, values in noise.items() if name.startswith(SCATTER)]))
+    scatter = squares_of / squares_of[:, 1:].mean(1, keepdims=True)
     widest = scatter.max(0)[:, None]  # wrong noise scatters no score wider
     squares, _ = standardise(np.stack(list(noise.values()), -1))
     each = {
