@@ -385,6 +385,8 @@ def _refit(
         own, others = float(maximum.log_likelihood.sum()), float(judged.sum())
         if own < threshold.drives and (threshold.stops_early or others < threshold.held_out):
             break
+    if len(fitted) == len(folds) and fitting == BY_LIKELIHOOD:
+        _begin_where_the_other_ended(fitted, found, held_out, judged_folds)
     judges, alone = Judges(fitted, found), torch.cat(held_out)
     if len(fitted) == len(folds) and fitting == BY_LIKELIHOOD:
         problems = [fold.fitting(program) for program, fold in zip(fitted, judged_folds, strict=True)]
@@ -395,6 +397,23 @@ def _refit(
             for program, fold in zip(judges.programs, judged_folds, strict=True)
         ]
     return Refit(fitted, found, judged_folds, fitting, judges, torch.cat(held_out), alone, unwidened)
+
+
+def _begin_where_the_other_ended(
+    programs: list[Program], maxima: list[Maximum], held_out: list[Tensor], folds: list[Fold]
+) -> None:
+    """Fit again, in place, where a fold's drives are likelier under the program of the other fold: a fit has ended at
+    another maximum, for example of process noise so wide that it goes through all readings."""
+    for index, other in ((0, 1), (1, 0)):
+        if float(held_out[other].sum() - maxima[index].log_likelihood.sum()) <= MIN_GAIN_OF_START:
+            continue
+        fold, problem = folds[index], folds[index].fitting(copy.deepcopy(programs[other]))
+        with suppress(FilterError):  # the drives cannot be followed from there
+            again = maximise(problem, folds[other].held_out_path)
+            if again.objective > maxima[index].objective + MIN_GAIN_OF_START:
+                judged, held_out_path = BY_LIKELIHOOD.judge(fold.judging(problem.program), folds[other].path)
+                programs[index], maxima[index], held_out[index] = problem.program, again, judged
+                folds[index] = replace(fold, path=again.path, held_out_path=held_out_path)
 
 
 def _fits(

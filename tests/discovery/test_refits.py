@@ -14,6 +14,7 @@ from steady_ppl.discovery.fitting import ByDraws
 from steady_ppl.discovery.refits import (
     Fold,
     _from,
+    _refit,
     first_by_draws,
     first_refit,
     fit_near,
@@ -45,6 +46,25 @@ def test_a_fit_begins_where_that_of_the_other_drives_ended_if_that_is_likelier(m
     assert (taken is problem) != is_taken and (ended is maximum) != is_taken
     assert torch.equal(taken.program.gain, start.gain if is_taken else program.gain)
     assert taken.program is not start
+
+
+@pytest.mark.parametrize("behind", [0, 1])
+def test_a_fold_that_ended_at_a_worse_maximum_begins_again_where_the_other_ended(behind: int) -> None:
+    program = example("linear_gaussian")
+    data = [drives(program, 3, 21, seed=seed) for seed in (1, 2)]
+    programs = [copy.deepcopy(program) for _ in data]
+    maxima = [maximise(Problem(one, part, True)) for one, part in zip(programs, data, strict=True)]
+    best = [float(maximum.objective) for maximum in maxima]
+    pairs = ((0, 1), (1, 0))
+    folds = [Fold(data[a], maxima[a].path, data[b], maxima[b].path, True) for a, b in pairs]
+    assert _refit(programs, folds, maxima).programs[behind] is programs[behind]  # each is at its best
+    programs[behind].gain = 3 * programs[behind].gain.detach()
+    worse = maxima[behind]
+    maxima[behind] = replace(worse, objective=worse.objective - 90, log_likelihood=worse.log_likelihood - 30)
+    refit = _refit(programs, folds, maxima)
+    ended = [float(maximum.objective) for maximum in refit.maxima]
+    assert ended == pytest.approx(best, abs=0.1)  # fits end within a tenth of a nat
+    assert refit.programs[1 - behind] is programs[1 - behind]
 
 
 @pytest.mark.slow
