@@ -22,7 +22,7 @@ from steady_ppl import Program, discover, for_program, load_program, log_likelih
 
 RESULT = Path(__file__).parent / "results" / "exact-unicycle.md"
 AS_WRITTEN, FIXED = "unicycle.py", "unicycle_fixed.py"
-TOO_COARSE = "The program's own time step is too coarse"
+TOO_COARSE = "The model's own time step is too coarse"
 MIN_LOG_LIKELIHOOD = 785.0  # nats a test drive, at the step that is taken
 PARTICLES = 1000  # looking ahead, for log p(y) of the test drives
 

@@ -1,7 +1,7 @@
 """Write docs/gallery.md and its pictures: python docs/gallery.py
 
-Each effect of the catalogue with its equation, where it occurs, the same drive with it and without it, and what it was
-confused with in the discovery benchmark.
+Each effect of the catalogue with its equation, where it occurs, the same trajectory with it and without it, and what it
+was confused with in the discovery benchmark.
 """
 
 from __future__ import annotations
@@ -81,7 +81,7 @@ def entry(effect: Effect, records: list[dict]) -> list[str]:
         f"**Feels:** {effect.feels}. **Where:** {effect.occurs}. "
         f"Typically c = {', '.join(f'{value:.3g}' for value in typical)}{unit}.",
         "",
-        f"![The same drive with and without {effect.name}](gallery/{slug(effect)}.png)",
+        f"![The same trajectory with and without {effect.name}](gallery/{slug(effect)}.png)",
         "",
         confusions(effect, records),
         "",
@@ -132,7 +132,7 @@ def program_of(effect: Effect) -> tuple[str, Program]:
             with torch.no_grad():
                 program.noise = program.noise * (1.0 if effect.form in ("spread", "colour") else QUIET)
             return name, program.requires_grad_(False)
-    raise SystemExit(f"no example program can have {effect.name}")
+    raise SystemExit(f"no example model can have {effect.name}")
 
 
 def picture(effect: Effect) -> Figure:

@@ -30,15 +30,15 @@ def fit(
     seed: int = 0,
     **run,
 ) -> Fit:
-    """Fit `program` to paths of the drives of `table` by the program `hand`.
+    """Fit `program` to paths of the trajectories of `table` by the program `hand`.
 
     Args:
         program: the state-space model, changed in place.
-        table: the training drives; true states, where there are any, are used for a known start only.
-        valid: held-out drives.
+        table: the training trajectories; true states, where there are any, are used for a known start only.
+        valid: held-out trajectories.
         known_start: the first row's true state is given.
         hand: the program written by hand, or where it is (`models/hovercraft.py`); of the same states.
-        lineages: paths of each drive (the paper: 8 on Hov, 1 on Hov+, 7 on Truck).
+        lineages: paths of each trajectory (the paper: 8 on Hov, 1 on Hov+, 7 on Truck).
         particles: of the filter that draws them; when None 200 of the lookahead proposal, 5000 of others (the
             paper: 100 000).
         steps, learning_rate, weight_decay, averaging, validate_every, validation_particles, patience, run: as in
@@ -50,10 +50,10 @@ def fit(
     settings = {name: value for name, value in locals().items() if name not in ("program", "table", "valid", "run")}
     require(lineages >= 1, "lineages", lineages, "at least 1")
     if hand is None:
-        raise UsageError("fit-hand needs the program written by hand: --hand MODEL, or hand=")
+        raise UsageError("fit-hand needs the model written by hand: --hand MODEL, or hand=")
     if isinstance(hand, str):
         hand = load_program(hand)
-    require(isinstance(hand, Program), "hand", hand, "a program, or where it is (MODEL.py)")
+    require(isinstance(hand, Program), "hand", hand, "a model, or where it is (MODEL.py)")
     settings["hand"] = type(hand).__name__
     if hand.state_names != program.state_names:
         raise UsageError(f"fit-hand: {type(hand).__name__} and {type(program).__name__} have different states")

@@ -27,11 +27,11 @@ def fit(
 
     Args:
         program: the state-space model, changed in place.
-        table: the training drives, every x. column filled.
-        valid: held-out drives.
+        table: the training trajectories, every x. column filled.
+        valid: held-out trajectories.
         known_start: the first row's true state is given to the filter of the validation.
-        steps: gradient steps, each on all drives.
-        validation_particles: N of the filter that judges the held-out drives, see `Validation.suited`.
+        steps: gradient steps, each on all trajectories.
+        validation_particles: N of the filter that judges the held-out trajectories, see `Validation.suited`.
         run: checkpoint, resume and progress of `train`.
     """
     settings = {name: value for name, value in locals().items() if name not in ("program", "table", "valid", "run")}

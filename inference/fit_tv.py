@@ -1,8 +1,8 @@
 """FitTV: a pose from each row's own measurements, its derivative by total variation, and the program fitted to both.
 
-What one does without a model of the motion. Nothing of the drives' true states is looked at, not even their start: the
-poses are `fixes`, and where a start is to be known theirs is taken (only held-out drives have a true one). Chartrand's
-total-variation derivative (2011) is pynumdiff's.
+What one does without a model of the motion. Nothing of the trajectories' true states is looked at, not even their
+start: the poses are `fixes`, and where a start is to be known theirs is taken (only held-out trajectories have a true
+one). Chartrand's total-variation derivative (2011) is pynumdiff's.
 """
 
 import dataclasses
@@ -47,8 +47,8 @@ def fit(
 
     Args:
         program: the state-space model, changed in place; its measurements tell the pose row by row (see `fixes`).
-        table: the training drives; true states are not looked at.
-        valid: held-out drives.
+        table: the training trajectories; true states are not looked at.
+        valid: held-out trajectories.
         known_start: the first row's true state is given to the filter of the validation.
         regularization: weight of the derivative's total variation (α in the paper, which has .01).
         iterations: of the derivative's solver.
@@ -56,8 +56,8 @@ def fit(
             `fit_truth`.
 
     Raises:
-        DataError: a drive's first or last row does not tell the pose by itself, see `fixes`; rows between that do not
-            are interpolated, and the fit's notes say how many.
+        DataError: a trajectory's first or last row does not tell the pose by itself, see `fixes`; rows between that do
+            not are interpolated, and the fit's notes say how many.
         UsageError: the program does not say which components are derivatives of which, or learns a map whose frame
             only the true starts would fix.
     """
@@ -81,7 +81,7 @@ def differentiated(program, data: Trajectories, poses: torch.Tensor, regularizat
     """The states `(T + 1, B, D)` of poses and their total-variation derivatives; gaps between poses are interpolated.
 
     Raises:
-        DataError: a drive does not begin and end with a pose.
+        DataError: a trajectory does not begin and end with a pose.
         UsageError: a component is no pose's derivative, or is told by no row.
         ComputationError: a derivative is not finite.
     """
@@ -89,9 +89,7 @@ def differentiated(program, data: Trajectories, poses: torch.Tensor, regularizat
     rates = program.derivatives
     missing = [name for name in order if name not in rates and name not in rates.values()]
     if missing:
-        raise UsageError(
-            f"fit-tv: program {type(program).__name__} does not say what {missing[0]} is the derivative of"
-        )
+        raise UsageError(f"fit-tv: model {type(program).__name__} does not say what {missing[0]} is the derivative of")
     states = torch.full_like(poses, torch.nan)
     for drive, rows in enumerate(data.lengths.tolist()):
         time = data.elapsed[:rows, drive].double().numpy(force=True)
@@ -104,7 +102,7 @@ def differentiated(program, data: Trajectories, poses: torch.Tensor, regularizat
             if not (there[0] and there[-1]):
                 raise DataError(
                     f"fit-tv: trajectory {data.labels[drive]}: its {'last' if there[0] else 'first'} row does not tell "
-                    f"{position} by itself, and nothing says how it moved there: cut the drive to rows that do",
+                    f"{position} by itself, and nothing says how it moved there: cut the trajectory to rows that do",
                     trajectory=data.labels[drive],
                 )
             known = np.unwrap(values[there]) if position in program.angles else values[there]

@@ -49,17 +49,17 @@ def fit(
 
     Args:
         program: the state-space model, changed in place.
-        table: the training drives; true states, where there are any, are used for a known start only.
-        valid: held-out drives.
+        table: the training trajectories; true states, where there are any, are used for a known start only.
+        valid: held-out trajectories.
         known_start: the first row's true state is given.
         steps: scoring steps at most.
         starts: fits; those after the first begin elsewhere, and the likeliest is kept.
-        validation_particles: N of the filter that judges the held-out drives, see `Validation.suited`.
+        validation_particles: N of the filter that judges the held-out trajectories, see `Validation.suited`.
         seed: of the search for paths.
 
     Raises:
         UsageError: a program that cannot be linearised, or a network.
-        FilterError: the drives cannot be smoothed.
+        FilterError: the trajectories cannot be smoothed.
     """
     settings = {"known_start": known_start, "steps": steps, "starts": starts}
     settings |= {"validation_particles": validation_particles, "seed": seed}
@@ -67,7 +67,7 @@ def fit(
     data = for_program(program, table).without_truth(keep_start=known_start)
     reason = why_not_linear(program, data, known_start=known_start)
     if reason:
-        raise UsageError(f"recipe likelihood needs a program that can be linearised: {reason.split(': looking')[0]}")
+        raise UsageError(f"recipe likelihood needs a model that can be linearised: {reason.split(': looking')[0]}")
     if data.time.is_cuda:
         raise UsageError("recipe likelihood computes on the CPU: leave --device out")
     notes, history = [], []
@@ -85,7 +85,7 @@ def fit(
         try:
             judge(0)
         except FilterError as error:
-            notes.append(f"as declared, the program cannot follow the held-out drives: {error}")
+            notes.append(f"as declared, the model cannot follow the held-out trajectories: {error}")
         begin()
         declared = copy.deepcopy(program)
         with kernel_failures() as why:

@@ -1,7 +1,7 @@
 """STEADY: learn a program's dynamics from measurements alone (IROS 2022).
 
-Each step draws paths of every drive from the posterior (the E step) and moves the parameters along the gradient of the
-paths' joint log-density (the M step). The observations' weight grows from `first_weight` to 1. Held-out log p(y)
+Each step draws paths of every trajectory from the posterior (the E step) and moves the parameters along the gradient of
+the paths' joint log-density (the M step). The observations' weight grows from `first_weight` to 1. Held-out log p(y)
 decides which parameters are kept. The paper's E step is the bootstrap particle filter; the others linearise it.
 """
 
@@ -88,17 +88,17 @@ def fit(
 
     Args:
         program: the state-space model, changed in place.
-        table: the training drives; true states, where there are any, are used for a known start only.
-        valid: held-out drives.
+        table: the training trajectories; true states, where there are any, are used for a known start only.
+        valid: held-out trajectories.
         known_start: the first row's true state is given.
         guide: the E step, one of GUIDES, or "auto": gaussian (lookahead if `particles` is given) where the program's
             noise is normal, else bootstrap, and `notes` say why. Settings that are None come from its DEFAULTS.
-        particles: N of the E step, for each drive; the Gaussian guide has none.
-        draws: M, paths for each drive in the M step.
+        particles: N of the E step, for each trajectory; the Gaussian guide has none.
+        draws: M, paths for each trajectory in the M step.
         steps: number of E steps.
         gradient_steps: Adam steps on the draws of each E step.
         learning_rate, betas, final_rate, weight_decay, averaging, batch, validate_every, patience: see `Optimization`.
-        validation_particles: N of the filter that judges the held-out drives, see `Validation.suited`.
+        validation_particles: N of the filter that judges the held-out trajectories, see `Validation.suited`.
         first_weight: the observation weight at the first step.
         ramp: share of the training over which it grows to 1.
         run: checkpoint, resume and progress of `train`.
@@ -158,7 +158,7 @@ def doubts(program, data: Trajectories, known_start: bool, seed: int, instead: s
         with seeded(seed, "doubts"):
             nats = float(neglected(program, data, known_start=known_start).abs().mean())
     except FilterError as error:
-        return [f"the filter that looks ahead breaks down on the learned program: {error}"]
+        return [f"the filter that looks ahead breaks down on the learned model: {error}"]
     if nats < 0.5:
         return []
-    return [f"linearised, the program misses log p(y) by {nats:.1f} nats a drive: try {instead}"]
+    return [f"linearised, the model misses log p(y) by {nats:.1f} nats a trajectory: try {instead}"]

@@ -68,19 +68,19 @@ def fit(
     Args:
         program: the state-space model, changed in place; its noise is normal, but for the mean-field guide, which takes
             any that is reparameterised.
-        table: the training drives; true states, where there are any, are used for a known start only.
-        valid: held-out drives.
+        table: the training trajectories; true states, where there are any, are used for a known start only.
+        valid: held-out trajectories.
         known_start: the first row's true state is given.
         guide: one of GUIDES.
         width, centred: of the network alone, see `InferenceNetwork`, which has their defaults.
-        draws: of each drive a step.
+        draws: of each trajectory a step.
         guide_rate: learning rate of the guide's parameters relative to the program's.
         first_kl_weight, annealing: the KL divergence's weight at the first step, and the share of the training over
             which it changes to 1; below 1 it is KL annealing (Bowman et al. 2016), above 1 it tempers the observations.
         steps: gradient steps.
         learning_rate, betas, final_rate, weight_decay, gradient_norm, averaging, batch, validate_every, patience: see
             `Optimization`.
-        validation_particles: N of the filter that judges the held-out drives.
+        validation_particles: N of the filter that judges the held-out trajectories.
         run: checkpoint, resume and progress of `train`.
 
     Raises:
@@ -97,7 +97,7 @@ def fit(
     data = for_program(program, table)
     reason = why_not_linear(program, data, known_start=known_start) if guide in LINEARIZING else None
     if reason:
-        raise UsageError(f"guide {guide} begins at the linearised program: {reason}; guide mean-field does without")
+        raise UsageError(f"guide {guide} begins at the linearised model: {reason}; guide mean-field does without")
     with seeded(seed, "prepare"):
         program.prepare(data, known_start)
         q = GUIDES[guide](

@@ -20,8 +20,9 @@ class Car(PlanarVehicle):
 
     A step takes the mean of these exponential responses over itself.
     The rear axle is `rear` m behind the tracked point, 0 by default; a subclass sets it to a number or a `PyroParam`.
-    The antenna's place, m ahead of the tracked point and to its left, is learned. Drives determine only the antenna's
-    distance from the rear axle: learn one of the two. Source: Rajamani, Vehicle Dynamics and Control, 2012, 2.2.
+    The antenna's place, m ahead of the tracked point and to its left, is learned. Trajectories determine only the
+    antenna's distance from the rear axle: learn one of the two. Source: Rajamani, Vehicle Dynamics and Control, 2012,
+    2.2.
     """
 
     controls = ("speed [m/s]", "steering [rad]")

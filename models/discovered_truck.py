@@ -1,4 +1,4 @@
-"""The AlphaTruck with what its hand-written program lacks, found from bearings alone (`make truck`, docs/truck.md)."""
+"""The AlphaTruck with what its hand-written model lacks, found from bearings alone (`make truck`, docs/truck.md)."""
 
 import pyro
 import pyro.distributions as dist
@@ -26,7 +26,7 @@ class DiscoveredTruck(Truck):
     σ         = noise · (1 + erratic · (|a_forward|, 0, |turn − yaw_rate|))
                                                                          it pulls and turns in unevenly
 
-    v and w are the forward and lateral velocity; the lever is that at 1.3 m/s, where these drives turn.
+    v and w are the forward and lateral velocity; the lever is that at 1.3 m/s, where these trajectories turn.
     """
 
     substeps = 4

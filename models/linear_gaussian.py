@@ -1,4 +1,4 @@
-"""The program that can be solved exactly: a damped cart on a rail, its position measured."""
+"""The model that can be solved exactly: a damped cart on a rail, its position measured."""
 
 import pyro
 import pyro.distributions as dist

@@ -1,4 +1,4 @@
-"""The programs of STEADY's tables (IROS 2022) with its authors' explicit Euler step: for comparison, not for use.
+"""The models of STEADY's tables (IROS 2022) with its authors' explicit Euler step: for comparison, not for use.
 
 No vehicle moves so: at 10 Hz this step has errors that look like physical effects.
 """

@@ -1,4 +1,4 @@
-"""The whole loop on drives with hidden effects: compare, learn what is missing, add it, fit again, prove.
+"""The whole loop on trajectories with hidden effects: compare, learn what is missing, add it, fit again, prove.
 
 Every step is a command as one could type it. That command is what runs, and the sentence below it is what it found.
 """
@@ -66,15 +66,15 @@ class Demo:
 DEMO_RECORD = "demo.json"  # of a demonstration; a folder without one is not a demonstration's
 OWNER_PROGRAM = "models/hovercraft.py"
 INTRODUCTION = (
-    "A hovercraft has drag, and its program has none. The data are noisy bearings to four landmarks, the controls, and "
-    "the first state of each drive (--known-start, as in the paper)."
+    "A hovercraft has drag, and its model has none. The data are noisy bearings to four landmarks, the controls, and "
+    "the first state of each trajectory (--known-start, as in the paper)."
 )
 
 
 @dataclass(frozen=True)
 class Size:
-    """How many drives are simulated to fit, to choose by, and to be locked away until the proof; and how many sets
-    calibrate the tests of `check` and `discover`, their own numbers when None."""
+    """How many trajectories are simulated to fit, to choose by, and to be locked away until the proof; and how many
+    sets calibrate the tests of `check` and `discover`, their own numbers when None."""
 
     train: int = 16
     valid: int = 16
@@ -90,7 +90,7 @@ class Size:
 def demonstrate(
     out: Path, command: Any, *, size: Size = Size(), force: bool = False, say: Callable[[str], None] = print
 ) -> None:
-    """Go through the loop and keep everything in a folder: tables of drives, programs, runs, figures, pictures.
+    """Go through the loop and keep everything in a folder: tables of trajectories, models, runs, figures, pictures.
 
     An earlier demonstration there is overwritten, and what is none where `force` says so.
 
@@ -105,19 +105,19 @@ def demonstrate(
     say(f"\n   $ cd {shlex.quote(str(out))}")
     with chdir(out):
         record_drives(demo, size)
-        demo.step("Fit the program without drag")
+        demo.step("Fit the model without drag")
         demo.result(_fit(demo, OWNER_PROGRAM, "before"))
-        demo.step("Check: does it fit the drives of its own fit?")
+        demo.step("Check: does it fit the trajectories of its own fit?")
         sets = size.calibration
         demo.steady(f"check runs/before train.csv{sets} --json check.json --picture check.png", keep="check.txt")
         demo.result(read_json(Path("check.json"), RunError)["verdict"])
         grown = add(demo, discover(demo, size))
-        demo.step("Fit again, in the same way, on the same drives; and the true structure, as the reference")
+        demo.step("Fit again, in the same way, on the same trajectories; and the true structure, as the reference")
         said = _fit(demo, grown, "after")
         _fit(demo, TRUE_PROGRAM, "oracle")
         demo.result(said)
         prove(demo)
-        demo.step("Check the finished model, on the same drives: what is left?")
+        demo.step("Check the finished model, on the same trajectories: what is left?")
         demo.steady(f"check runs/after test.csv{sets} --json after.json", keep="after.txt")
         demo.result(read_json(Path("after.json"), RunError)["verdict"])
         demo.step("See it: everything on one page")
@@ -126,21 +126,21 @@ def demonstrate(
         hidden = f"What had been hidden: {st.load_program(TRUE_PROGRAM)}."
         say(textwrap.fill(hidden, TEXT_WIDTH, initial_indent="\n   ", subsequent_indent="   "))
     _write_record(out, {"status": "finished", "seconds": round(time.perf_counter() - began, 1), "steps": demo.steps})
-    say(f"\n{out}: report.html; check, discovery and proof as .png, .txt and .json; drives; runs; {grown}")
+    say(f"\n{out}: report.html; check, discovery and proof as .png, .txt and .json; trajectories; runs; {grown}")
     say(f"{time.perf_counter() - began:.0f} s in all")
 
 
 def record_drives(demo: Demo, size: Size) -> None:
-    """Simulate drives of a hovercraft with drag, and drop its poses."""
-    demo.step("Simulate drives of a hovercraft with drag")
+    """Simulate trajectories of a hovercraft with drag, and drop its poses."""
+    demo.step("Simulate trajectories of a hovercraft with drag")
     for seed, (name, count) in enumerate((("train", size.train), ("valid", size.valid), ("test", size.test)), 1):
         demo.steady(f"simulate {TRUE_PROGRAM} --trajectories {count} --seed {seed} --out {name}.csv")
     for table in ("train.csv", "valid.csv"):
         st.write_table(st.read_table(table).without_truth(keep_start=True), table)
     demo.result(
-        f"{size.train} drives for the fit and {size.valid} for validation keep controls, bearings and the first state. "
-        f"{size.test} more with true poses are held out for the proof. The hovercraft moves in steps of 5 ms, its "
-        "programs in those of the rows."
+        f"{size.train} trajectories for the fit and {size.valid} for validation keep controls, bearings and the first "
+        f"state. {size.test} more with true poses are held out for the proof. The hovercraft moves in steps of 5 ms, "
+        "its models in those of the rows."
     )
 
 
@@ -162,8 +162,8 @@ def discover(demo: Demo, size: Size) -> list[str]:
 
 
 def add(demo: Demo, effects: Sequence[str]) -> str:
-    """Write the program with the effects beside the owner's."""
-    demo.step("Add: write the program with it")
+    """Write the model with the effects beside the owner's."""
+    demo.step("Add: write the model with it")
     names = dict.fromkeys(effect.split(":")[0].split("=")[0] for effect in effects)
     grown = f"models/hovercraft_with_{'_and_'.join(names)}.py"
     equations = [line for line in demo.steady(f"add runs/found --out {grown}").splitlines()[1:] if "$" not in line]
@@ -172,8 +172,8 @@ def add(demo: Demo, effects: Sequence[str]) -> str:
 
 
 def prove(demo: Demo) -> None:
-    """Before and after on the held-out drives."""
-    demo.step("Prove: on the held-out drives")
+    """Before and after on the held-out trajectories."""
+    demo.step("Prove: on the held-out trajectories")
     demo.steady(
         f"prove runs/before runs/after test.csv --oracle runs/oracle --truth {TRUE_PROGRAM} "
         "--json proof.json --picture proof.png",
@@ -205,13 +205,13 @@ def _summary(figures: Mapping[str, Any]) -> list[str]:
 
 
 def _fit(demo: Demo, program: str, run: str) -> str:
-    """The fitted program, in a line."""
+    """The fitted model, in a line."""
     said = demo.steady(f"fit {program} train.csv --valid valid.csv --known-start --out runs/{run}")
     return said.splitlines()[0].removeprefix(f"runs/{run}: ") + "."
 
 
 def _open(out: Path, force: bool) -> None:
-    """Make the folder, mark it as a demonstration's, and put the owner's program there."""
+    """Make the folder, mark it as a demonstration's, and put the owner's model there."""
     if out.exists() and not force and not (out / DEMO_RECORD).is_file():
         raise RunError(f"{out} exists and is no demo's: choose another folder, or --force to write into it")
     source = workbench() / OWNER_PROGRAM
@@ -230,8 +230,8 @@ def demo(
     out: Annotated[Path, typer.Option("--out", help="Folder to write.")] = Path("out/demo"),
     force: Annotated[bool, typer.Option("--force", help="Write into a folder that is no demo's.")] = False,
 ) -> None:
-    """Run the whole loop (check, discover, add, fit again, prove) on a hovercraft whose program has no drag.
+    """Run the whole loop (check, discover, add, fit again, prove) on a hovercraft whose model has no drag.
 
-    It prints the commands that it runs, with what they found, and keeps drives, programs, runs and pictures.
+    It prints the commands that it runs, with what they found, and keeps trajectories, models, runs and pictures.
     """
     demonstrate(out, context.find_root().command, force=force, say=tell)

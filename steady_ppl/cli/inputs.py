@@ -1,4 +1,4 @@
-"""What commands read: programs, runs and their labels, drives."""
+"""What commands read: models, runs and their labels, trajectories."""
 
 import shlex
 from collections.abc import Collection, Mapping, Sequence
@@ -13,12 +13,12 @@ from steady_ppl.utils.text import say
 def fit_or_program(
     source: str, program: str | None, seed: int = 0, substeps: int | None = None
 ) -> "st.Fit | st.Program":
-    """The fit in a run folder, or else the program of a file; UsageError: `program` is given for what is no run."""
+    """The fit in a run folder, or else the model of a file; UsageError: `program` is given for what is no run."""
     from steady_ppl.model.validate import probe
 
     if not Path(source).is_dir():
         if program:
-            raise UsageError("--program names the program of a RUN: leave it out")
+            raise UsageError("--program names the model of a RUN: leave it out")
         return program_from(source, seed, substeps)
     fit = st.Fit.load(source, program)
     if substeps is not None:
@@ -28,7 +28,7 @@ def fit_or_program(
 
 
 def program_from(model: str, seed: int, substeps: int | None = None) -> "st.Program":
-    """Load a program, its random initial weights keyed by the seed, and try it once on a probe; with as many substeps a
+    """Load a model, its random initial weights keyed by the seed, and try it once on a probe; with as many substeps a
     row as its class says when None."""
     from steady_ppl.model.validate import probe
 
@@ -41,7 +41,7 @@ def program_from(model: str, seed: int, substeps: int | None = None) -> "st.Prog
 
 
 def read_drives(table: Path, program: "st.Program", known: Collection[str] = ()) -> "st.Trajectories":
-    """The drives of a table; what is suspicious in it is said, but for the kinds that are `known` to be said later."""
+    """The trajectories of a table; what is suspicious in it is said, but for kinds `known` to be said later."""
     doctor_says = f"`steady doctor {shlex.quote(str(table))}` says how to mend it"
     try:
         drives = st.read_table(table)
@@ -74,7 +74,7 @@ def run_labels(runs: Sequence[Path], taken: Collection[str] = ()) -> dict[str, P
 
 
 def load_runs(labels: Mapping[str, Path], programs: Sequence[str] | None) -> "dict[str, st.Fit]":
-    """The fits of runs by label, with the programs that `--program` names, one for each, or their own."""
+    """The fits of runs by label, with the models that `--program` names, one for each, or their own."""
     sources: Sequence[str | None] = programs or [None] * len(labels)
     if len(sources) != len(labels):
         raise UsageError(f"--program is given {len(sources)} times for {len(labels)} runs: name one for each, in order")
@@ -92,5 +92,5 @@ def used_before(runs: Mapping[str, Path], table: str) -> list[str]:
             continue  # was given it, and learned nothing
         for key, how in (("table_sha256", "fitted to"), ("valid_sha256", "chosen by")):
             if record.get(key) == table:
-                notes.append(f"{label} was {how} this very table: the comparison needs drives that were not used")
+                notes.append(f"{label} was {how} this very table: the comparison needs trajectories that were not used")
     return notes

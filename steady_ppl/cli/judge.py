@@ -1,4 +1,4 @@
-"""`steady doctor`, `check`, `prove`, `evaluate`, `states` and `report`: what runs say of drives."""
+"""`steady doctor`, `check`, `prove`, `evaluate`, `states` and `report`: what runs say of trajectories."""
 
 import os
 import shlex
@@ -22,7 +22,7 @@ SIMULATIONS = 100  # sets for the bands of a report
 
 def doctor(
     table: Annotated[Path, typer.Argument(help="Table, .csv or .parquet.")],
-    model: Annotated[str | None, typer.Argument(help="Program: its units and step are used.")] = None,
+    model: Annotated[str | None, typer.Argument(help="Model: its units and step are used.")] = None,
     json_file: options.Json = None,
 ) -> None:
     """List suspicious cells of a table, each with the line that mends it."""
@@ -33,7 +33,7 @@ def doctor(
 
 def check(
     run: options.Run,
-    table: Annotated[Path, typer.Argument(help="Drives, preferably not those of the fit.")],
+    table: Annotated[Path, typer.Argument(help="Trajectories, preferably not those of the fit.")],
     json_file: options.Json = None,
     picture: Annotated[Path | None, typer.Option(help="Picture to write, for example .png.")] = None,
     mask: Annotated[
@@ -73,7 +73,7 @@ def check(
 
 def prove(
     arguments: options.RunsAndTable,
-    truth: Annotated[str | None, typer.Option(help="Program that simulated the drives, if there is one.")] = None,
+    truth: Annotated[str | None, typer.Option(help="Model that simulated the trajectories, if there is one.")] = None,
     oracle: Annotated[Path | None, typer.Option(help="Run of the true structure, fitted like the others.")] = None,
     json_file: options.Json = None,
     picture: Annotated[Path | None, typer.Option(help="Picture of the errors to write, for example .png.")] = None,
@@ -113,7 +113,7 @@ def evaluate(
     seed: options.Seed = 0,
     surveyed: Annotated[
         str | None,
-        typer.Option("--map", help="Program of the same vehicle with the true landmarks, for runs that learn theirs."),
+        typer.Option("--map", help="Model of the same vehicle with the true landmarks, for runs that learn theirs."),
     ] = None,
     program: Annotated[list[str] | None, options.moved("with several RUNs once for each, in their order")] = None,
 ) -> None:
@@ -146,27 +146,27 @@ def evaluate(
         share, count, drive = (result["scarce"][key] for key in ("share", "particles", "trajectory"))
         if share > MIN_SHARE_OF_POOR_ROWS:
             say(
-                f"{run}: after {share:.0%} of drive {drive}'s measured rows fewer than {MIN_EFFECTIVE_SIZE} of the "
-                f"filter's {count} particles were in effect: its log p(y) scatters and is mostly too low, "
+                f"{run}: after {share:.0%} of trajectory {drive}'s measured rows fewer than {MIN_EFFECTIVE_SIZE} of "
+                f"the filter's {count} particles were in effect: its log p(y) scatters and is mostly too low, "
                 "raise --particles"
             )
 
 
 def states(
     run: options.Run,
-    table: Annotated[Path, typer.Argument(help="Drives.")],
+    table: Annotated[Path, typer.Argument(help="Trajectories.")],
     out: Annotated[
         Path,
         typer.Option(
             "--out", help="A table (.csv, .parquet) of medians and 90 % intervals, or all draws for ArviZ (.nc)."
         ),
     ],
-    draws: Annotated[int, options.count("Paths of each drive.")] = 100,
+    draws: Annotated[int, options.count("Paths of each trajectory.")] = 100,
     particles: Annotated[int | None, options.count("Particles of the filter.")] = None,
     program: options.Moved = None,
     seed: options.Seed = 0,
 ) -> None:
-    """Write posterior draws of the states, given all measurements of a drive.
+    """Write posterior draws of the states, given all measurements of a trajectory.
 
     The table has for each state its median and the ends of its 90 % interval, `…_low` and `…_high`.
     """
@@ -180,7 +180,7 @@ def states(
     settings: dict[str, Any] = {"draws": draws, "particles": particles, "known_start": fit.known_start, "seed": seed}
     posterior = drawn_states(fit.program, drives, **settings)
     write_states(posterior, out)
-    tell(f"{out}: {len(drives)} drives, {draws} draws of each")
+    tell(f"{out}: {len(drives)} trajectories, {draws} draws of each")
     scarce = degeneracy_note(float(posterior["sample_stats"]["roots"].min()))
     say(*diagnose_units(fit.program, st.for_program(fit.program, drives)), *([scarce] if scarce else []))
 
@@ -222,7 +222,7 @@ def report(
     words = ["steady", "report", *map(str, arguments)]
     words += [word for name, value in [*given, ("--out", out)] if value is not None for word in (name, str(value))]
     digest = fingerprint(drives)
-    how = [*_commands_of(runs, discovery), f"# {table}: sha256 of its drives {digest[:16]}…", shlex.join(words)]
+    how = [*_commands_of(runs, discovery), f"# {table}: sha256 of its trajectories {digest[:16]}…", shlex.join(words)]
     st.report(
         fits,
         drives,
@@ -234,7 +234,7 @@ def report(
         horizons=horizon or (),
         seed=seed,
     ).write(out)
-    tell(f"{out}: {', '.join(labels)} on {len(drives)} drives")
+    tell(f"{out}: {', '.join(labels)} on {len(drives)} trajectories")
 
 
 def _commands_of(runs: list[Path], discovery: Path | None) -> list[str]:
@@ -248,7 +248,7 @@ def _commands_of(runs: list[Path], discovery: Path | None) -> list[str]:
         record = read_record(run)
         source = record["program"]
         start = "with" if record["known_start"] else "without"
-        name = f"{os.path.relpath(run / source['file'])}:{source['class']}" if source else "a program of no file"
+        name = f"{os.path.relpath(run / source['file'])}:{source['class']}" if source else "a model of no file"
         made.append(f"# {run}: {name}, recipe {record['recipe']}, seed {record['seed']}, {start} a known start")
         if command := record.get("command"):
             made.append(command)

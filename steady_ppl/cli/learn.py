@@ -1,4 +1,4 @@
-"""`steady fit`, `discover`, `add`, `effects`, `study` and `plot-study`: programs and what they learn."""
+"""`steady fit`, `discover`, `add`, `effects`, `study` and `plot-study`: models and what they learn."""
 
 import ast
 import signal
@@ -30,9 +30,9 @@ GuideName = Literal["lookahead", "gaussian", "bootstrap", "network", "mean-field
 def fit(
     context: typer.Context,
     model: options.Model,
-    table: Annotated[Path, typer.Argument(help="Training drives, .csv or .parquet.")],
+    table: Annotated[Path, typer.Argument(help="Training trajectories, .csv or .parquet.")],
     out: Annotated[Path, typer.Option("--out", help="Run folder to write.")],
-    valid: Annotated[Path | None, typer.Option(help="Held-out drives: the stopping rule.")] = None,
+    valid: Annotated[Path | None, typer.Option(help="Held-out trajectories: the stopping rule.")] = None,
     recipe: Annotated[
         str | None,
         typer.Option(
@@ -44,11 +44,11 @@ def fit(
     guide: Annotated[
         GuideName | None, typer.Option(help="The E step: the first three steady's, the others svi's.")
     ] = None,
-    hand: Annotated[str | None, typer.Option(help="The program written by hand, for fit-hand.")] = None,
+    hand: Annotated[str | None, typer.Option(help="The model written by hand, for fit-hand.")] = None,
     known_start: Annotated[bool, typer.Option(help="Give the first row's x. columns as the exact start.")] = False,
     substeps: options.Substeps = None,
-    particles: Annotated[int | None, options.count("Particles for each drive.")] = None,
-    draws: Annotated[int | None, options.count("Paths for each drive in the M step.")] = None,
+    particles: Annotated[int | None, options.count("Particles for each trajectory.")] = None,
+    draws: Annotated[int | None, options.count("Paths for each trajectory in the M step.")] = None,
     steps: Annotated[int | None, options.count("Steps of the recipe, see its settings.")] = None,
     setting: Annotated[
         list[str] | None,
@@ -59,7 +59,7 @@ def fit(
     resume: Annotated[bool, typer.Option("--resume", help="Continue an interrupted run.")] = False,
     force: options.Overwrite = False,
 ) -> None:
-    """Learn a program's parameters from measurements."""
+    """Learn a model's parameters from measurements."""
     from steady_ppl.runs.recipes import run_recipe
 
     given = {"particles": particles, "draws": draws, "steps": steps, "hand": hand, "guide": guide}
@@ -84,7 +84,7 @@ def fit(
         if result.trained.rise:
             first, kept = result.trained.rise
             rise = f"{first:.2f} → {kept:.2f} at step {result.trained.kept}"
-            tell(f"held-out log p(y) of a drive {rise}, whose parameters were kept")
+            tell(f"held-out log p(y) of a trajectory {rise}, whose parameters were kept")
         if result.trained.interrupted:
             say(f"interrupted; the run so far is usable, `--resume` continues {out}")
             raise typer.Exit(1)
@@ -110,17 +110,19 @@ def _settings(pairs: list[str], found: dict[str, Any]) -> dict[str, Any]:
 
 
 def discover(
-    source: Annotated[str, typer.Argument(metavar="RUN|MODEL", help="A run folder, or a program to fit first.")],
-    table: Annotated[Path, typer.Argument(help="Drives to test and fit.")],
+    source: Annotated[str, typer.Argument(metavar="RUN|MODEL", help="A run folder, or a model to fit first.")],
+    table: Annotated[Path, typer.Argument(help="Trajectories to test and fit.")],
     valid: Annotated[
-        Path | None, typer.Option(help="Validation drives; every second drive of TABLE when not given.")
+        Path | None, typer.Option(help="Validation trajectories; every second trajectory of TABLE when not given.")
     ] = None,
     known_start: Annotated[
         bool | None,
         typer.Option(help="Give the first row's x. columns as the exact start; a RUN's own setting when not given."),
     ] = None,
     substeps: options.Substeps = None,
-    mix: Annotated[bool, typer.Option("--mix", help="Join both tables and validate on every second drive.")] = False,
+    mix: Annotated[
+        bool, typer.Option("--mix", help="Join both tables and validate on every second trajectory.")
+    ] = False,
     out: Annotated[Path | None, typer.Option("--out", help="Run folder for the improved fit.")] = None,
     json_file: options.Json = None,
     picture: Annotated[Path | None, typer.Option(help="Picture to write, for example .png.")] = None,
@@ -213,8 +215,8 @@ def stopped_after(minutes: float | None) -> Iterator[Event]:
 
 
 def add(
-    source: Annotated[str, typer.Argument(metavar="RUN|MODEL", help="A run folder, or a program's file.")],
-    out: Annotated[Path, typer.Option("--out", metavar="MODEL.py", help="Program to write, beside the old one.")],
+    source: Annotated[str, typer.Argument(metavar="RUN|MODEL", help="A run folder, or a model's file.")],
+    out: Annotated[Path, typer.Option("--out", metavar="MODEL.py", help="Model to write, beside the old one.")],
     effects: Annotated[
         list[str] | None,
         typer.Argument(metavar="EFFECT...", help="NAME[:AT][:OPTION=NUMBER][=NUMBER[,NUMBER]], see `steady effects`."),
@@ -222,7 +224,7 @@ def add(
     program: options.MovedOfRun = None,
     force: Annotated[bool, typer.Option("--force", help="Overwrite an existing file.")] = False,
 ) -> None:
-    """Write a program with physical effects; `fit` it like any other.
+    """Write a model with physical effects; `fit` it like any other.
 
     Its parameters start at the run's values, a coefficient at the value that is given, else at the run's, else at the
     effect's typical one.
@@ -244,9 +246,9 @@ def add(
 
 
 def effects(
-    model: Annotated[str | None, typer.Argument(help="List only the effects that apply to this program.")] = None,
+    model: Annotated[str | None, typer.Argument(help="List only the effects that apply to this model.")] = None,
 ) -> None:
-    """List the physical effects that a program may lack."""
+    """List the physical effects that a model may lack."""
     from steady_ppl.effects.registry import page
 
     tell(page(program_from(model, 0) if model else None), end="")
@@ -262,7 +264,7 @@ def study(
     data: Annotated[Path | None, typer.Option(help="Folder of the logs or tables, if elsewhere.")] = None,
     again: Annotated[bool, typer.Option("--again", help="Repeat failed jobs.")] = False,
 ) -> None:
-    """Compute a grid of programs, data, recipes, settings and seeds, each job by itself.
+    """Compute a grid of models, data, recipes, settings and seeds, each job by itself.
 
     Results come into DIR/results.parquet, a row a job. The same command resumes, and computes only what is
     missing or has changed. `steady plot-study DIR` draws it.

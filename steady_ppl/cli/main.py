@@ -48,8 +48,8 @@ def add_command(function: Callable[..., None], about: str, *examples: str, hidde
     app.command(function.__name__.replace("_", "-"), short_help=about, epilog=epilog, hidden=hidden)(function)
 
 
-add_command(demo.demo, "Run the whole loop on drives with a hidden effect.", "steady demo --out demo")
-add_command(make.init, "Make a folder to work in, with first drives.", "steady init lab")
+add_command(demo.demo, "Run the whole loop on trajectories with a hidden effect.", "steady demo --out demo")
+add_command(make.init, "Make a folder to work in, with first trajectories.", "steady init lab")
 add_command(
     new.new,
     "Write a model from parts: vehicle, controls, sensors.",
@@ -74,7 +74,7 @@ add_command(
 )
 add_command(
     make.simulate,
-    "Simulate drives of a program.",
+    "Simulate trajectories of a model.",
     "steady simulate models/hovercraft.py --trajectories 16 --out train.csv",
     "steady simulate models/hovercraft.py --effect wind=1,0.5 --out windy.csv",
     "steady simulate mine.py:Boat --controls drives.csv --out again.csv",
@@ -87,7 +87,7 @@ add_command(
 )
 add_command(
     learn.fit,
-    "Learn a program's parameters from measurements.",
+    "Learn a model's parameters from measurements.",
     "steady fit mine.py train.csv --valid valid.csv --recipe likelihood --out runs/first",
     "steady fit models/neural_vehicle.py:NeuralHovercraft train.csv --known-start --out runs/net",
     "steady fit mine.py train.csv --recipe svi --set learning_rate=1e-3 --out runs/svi",
@@ -106,13 +106,13 @@ add_command(
 )
 add_command(
     learn.add,
-    "Write a program with physical effects.",
+    "Write a model with physical effects.",
     "steady add runs/found --out models/with_drag.py",
     "steady add models/hovercraft.py yaw_linear_drag=0.05 wind --out models/windy.py",
 )
 add_command(
     judge.prove,
-    "Compare runs on held-out drives.",
+    "Compare runs on held-out trajectories.",
     "steady prove runs/before runs/after test.csv --picture proof.png",
 )
 add_command(
@@ -146,7 +146,7 @@ add_command(
     "steady effects models/hovercraft.py",
     hidden=True,
 )
-app.add_typer(make.app, name="data", hidden=True, short_help="Published logs to tables; long drives in pieces.")
+app.add_typer(make.app, name="data", hidden=True, short_help="Published logs to tables; long trajectories in pieces.")
 
 
 def say_version(asked: bool) -> None:

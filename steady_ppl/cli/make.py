@@ -29,7 +29,7 @@ NEXT_COMMANDS = (
 
 
 def init(folder: Annotated[Path, typer.Argument(metavar="DIR", help="The folder to make.")]) -> None:
-    """Make a folder to work in: programs, recipes and first tables of drives to try them on."""
+    """Make a folder to work in: models, recipes and first tables of trajectories to try them on."""
     from steady_ppl.runs.workbench import FOLDERS, make_workbench
 
     tables = make_workbench(folder)
@@ -174,11 +174,11 @@ def alpha_truck(
 
 @app.command("cut", epilog="Example:  steady data cut log.csv --seconds 60 --out drives.csv")
 def cut(
-    table: Annotated[Path, typer.Argument(help="Drives.")],
+    table: Annotated[Path, typer.Argument(help="Trajectories.")],
     seconds: Annotated[float, typer.Option(help="Length of a piece, s.")],
     out: options.Table,
 ) -> None:
-    """Long drives in pieces, `…-1`, `…-2`, … of the drive's name.
+    """Long trajectories in pieces, `…-1`, `…-2`, … of the trajectory's name.
 
     Each begins at its first row that has a measurement; pieces of one row or without a measurement are left out.
     """
@@ -188,38 +188,38 @@ def cut(
     drives = st.read_table(table)
     pieces = st.cut(drives, seconds)
     st.write_table(pieces, out)
-    tell(f"{out}: {len(pieces)} drives")
+    tell(f"{out}: {len(pieces)} trajectories")
     if left_out := int(drives.lengths.sum() - pieces.lengths.sum()):
         say(f"{left_out} rows left out: before a piece's first measurement, or in pieces that have none or one row")
 
 
 @app.callback()
 def data() -> None:
-    """Published logs to tables; long drives in pieces."""
+    """Published logs to tables; long trajectories in pieces."""
 
 
 def simulate(
     model: options.Model,
     out: options.Table,
-    trajectories: Annotated[int | None, options.count("How many drives, 16 when not given.")] = None,
+    trajectories: Annotated[int | None, options.count("How many trajectories, 16 when not given.")] = None,
     seed: options.Seed = 0,
     controls: Annotated[Path | None, typer.Option(help="Table whose times, controls and gaps are used.")] = None,
     substeps: Annotated[
         int | None,
-        typer.Option(help="Steps of the program in each row; enough for 5 ms or less when not given."),
+        typer.Option(help="Steps of the model in each row; enough for 5 ms or less when not given."),
     ] = None,
     effect: Annotated[
         list[str] | None,
         typer.Option(metavar="NAME[=VALUE]", help="Add a physical effect, see `steady effects`; repeat for several."),
     ] = None,
 ) -> None:
-    """Simulate drives of a program, with measurements and true states."""
+    """Simulate trajectories of a model, with measurements and true states."""
     from steady_ppl.effects import with_effects
     from steady_ppl.model.validate import probe
     from steady_ppl.smc.simulate import simulated_in
 
     if controls and trajectories:
-        raise UsageError("--controls has as many drives as its table: leave --trajectories out")
+        raise UsageError("--controls has as many trajectories as its table: leave --trajectories out")
     program, values = with_effects(program_from(model, seed), effect or [])
     say(*values)
     if substeps is not None:

@@ -41,5 +41,7 @@ def as_refusal(error: Exception) -> SteadyError | None:
     if isinstance(error, OSError) and error.errno in NO_SPACE:  # numba says no name of its cache
         return UsageError(f"a file cannot be written: {error.strerror}")
     if isinstance(error, MemoryError) or (isinstance(error, RuntimeError) and any(w in str(error) for w in NO_MEMORY)):
-        return ComputationError("this needs more memory than there is: take fewer or shorter drives, or less of each")
+        return ComputationError(
+            "this needs more memory than there is: take fewer or shorter trajectories, or less of each"
+        )
     return None

@@ -52,7 +52,7 @@ def evaluate(
 
     Args:
         fit: what is judged; its `known_start` decides whether the filters start at the true first state.
-        table: drives that were not used for the fit.
+        table: trajectories that were not used for the fit.
         particles: N of each filter (the paper: 100 000); 200 looking ahead and 5000 otherwise when not given.
         rollouts: noisy roll-outs from each true state.
         look_ahead: whether log p(y) and the states come from a filter that looks ahead; None where the program allows.
@@ -67,7 +67,7 @@ def evaluate(
         `map` (see `map_errors`; `learned`: whether the landmarks are elsewhere than declared).
 
     Raises:
-        DataError: the table lacks a column or a known start, or a drive is too long (`refuse_long`).
+        DataError: the table lacks a column or a known start, or a trajectory is too long (`refuse_long`).
         UsageError: the map is none, or another vehicle's.
         FilterError: the filter broke down.
     """
@@ -129,7 +129,7 @@ def _checked(fit: Fit, table: Trajectories, surveyed: Program | None) -> tuple[P
 def _errors_of_map(program: Program, surveyed: Program) -> dict[str, Any]:
     for one in (program, surveyed):
         if not len(getattr(one, "landmarks", ())):
-            raise UsageError(f"program {type(one).__name__} has no landmarks: judge it without a map")
+            raise UsageError(f"model {type(one).__name__} has no landmarks: judge it without a map")
     errors = map_errors(program, surveyed)
 
     def form(one: Program) -> tuple[tuple[str, ...], ...]:
@@ -140,7 +140,7 @@ def _errors_of_map(program: Program, surveyed: Program) -> dict[str, Any]:
         if own != other:
             raise UsageError(
                 f"the map is another vehicle's: {type(surveyed).__name__} has the {what} {', '.join(other)}, "
-                f"{type(program).__name__} has {', '.join(own)}; name a program of the same vehicle"
+                f"{type(program).__name__} has {', '.join(own)}; name a model of the same vehicle"
             )
     learned = isinstance(program, UnknownMap) and not torch.equal(program.landmarks, program.declared)
     return {**errors, "learned": learned}
@@ -272,7 +272,7 @@ def map_errors(program: Program, surveyed: Program) -> Errors:
     places = []
     for one in (program, surveyed):
         if not isinstance(one, PlanarVehicle):
-            raise UsageError(f"program {type(one).__name__} has no landmarks: it is no PlanarVehicle")
+            raise UsageError(f"model {type(one).__name__} has no landmarks: it is no PlanarVehicle")
         places.append(torch.as_tensor(one.landmarks).detach().double().cpu())
     if places[0].shape != places[1].shape:
         raise UsageError(f"{len(places[0])} landmarks cannot be compared with {len(places[1])}")

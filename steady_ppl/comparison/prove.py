@@ -57,7 +57,7 @@ def prove(
     horizons: Sequence[float] = (),
     seed: int = 0,
 ) -> Proof:
-    """Compare programs on drives: log p(y), open-loop errors, coverage, noise scales.
+    """Compare programs on trajectories: log p(y), open-loop errors, coverage, noise scales.
 
     log p(y) is that of the linearised program, per trajectory; what a particle filter adds to it is near zero where it
     can be trusted. Errors are root mean squares of measured less predicted, some times ahead of every row's filtered
@@ -67,13 +67,13 @@ def prove(
     Args:
         rows: name → program, best the one before first and the one after second; further ones such as the oracle's
             structure refitted and the true parameters. Their noise is normal, their measurements' normal or Student t.
-        data: drives on which none of them was fitted.
+        data: trajectories on which none of them was fitted.
         known_start: the first row's x. columns are the exact start; None: if every `Fit` among the rows was so fitted.
         reference: the row that the others are compared with, the first when not given.
-        truth: the row whose program made the drives; its own simulated drives give the noise floor.
+        truth: the row whose program made the trajectories; its own simulated trajectories give the noise floor.
         with_constant_velocity: add a row of the reference without any acceleration but noise.
-        paths: name → path near the posterior means of the drives, where one is known; others are searched for.
-        horizons: seconds ahead; those that suit the drives where none is given, see `data.horizons`.
+        paths: name → path near the posterior means of the trajectories, where one is known; others are searched for.
+        horizons: seconds ahead; those that suit the trajectories where none is given, see `data.horizons`.
         seed: of the search for paths, the simulation and the resampling.
 
     Raises:
@@ -165,7 +165,7 @@ def unconverged(rows: Mapping[str, Program | Fit]) -> list[str]:
 
 def _require(programs: Mapping[str, Program], reference: str, truth: str | None, data: Trajectories) -> None:
     if len(programs) < 2:
-        raise UsageError(f"got {len(programs)} program: a proof needs one before and one after")
+        raise UsageError(f"got {len(programs)} model: a proof needs one before and one after")
     for name in (reference, truth):
         if name is not None and name not in programs:
             raise UsageError(f"there is no row {name!r}; the rows are {', '.join(programs)}")
@@ -210,7 +210,8 @@ def _few_rows(data: Trajectories, horizons: Mapping[str, int], known_start: bool
     notes, length = [], data.time.shape[0]
     for name, horizon in horizons.items():
         if length - horizon <= 5 < length - 1:
-            said = f"{name} ahead is judged from the first {'row' if length - horizon == 1 else 'rows'} of a drive only"
+            rows = "row" if length - horizon == 1 else "rows"
+            said = f"{name} ahead is judged from the first {rows} of a trajectory only"
             notes.append(said if known_start else said + ", where the state is least known")
     return notes
 
@@ -239,7 +240,7 @@ def doubtful(rows: Mapping[str, ProgramScores], data: Trajectories) -> list[str]
         said = f"{abs(by):.1f} nats {'above' if by > 0 else 'below'}" if math.isfinite(by) else "not comparable with"
         others = f" ({count - 1} other{'s' if count > 2 else ''} likewise)" if count > 1 else ""
         notes.append(
-            f"{name}: on drive {data.labels[worst]} a particle filter's log p(y) is {said} the linearised "
-            f"program's{others}: look at it before you trust the table"
+            f"{name}: on trajectory {data.labels[worst]} a particle filter's log p(y) is {said} the linearised "
+            f"model's{others}: look at it before you trust the table"
         )
     return notes

@@ -55,7 +55,7 @@ class Proof(Displayed):
         reference: the name of the row that the others are compared with.
         horizons: name → how many rows ahead, "one step" first.
         step: s, of a row.
-        trajectories: how many drives.
+        trajectories: how many trajectories.
         known_start: whether the true first states were given.
         seed: of the resampling.
         outliers: readings that every program finds wrong; nothing else is about them.
@@ -107,8 +107,8 @@ class Proof(Displayed):
         content = self.figures
         rows, horizons = content["rows"], list(content["horizons"])
         far = horizons[1:] or horizons
-        drives = f"{self.trajectories} drives; differences are from {self.reference}"
-        said = f"{drives}, with {COVERAGE:.0%} intervals bootstrapped over drives"
+        drives = f"{self.trajectories} trajectories; differences are from {self.reference}"
+        said = f"{drives}, with {COVERAGE:.0%} intervals bootstrapped over trajectories"
         lines = [*textwrap.wrap(content["verdict"], TEXT_WIDTH), "", said, ""]
         bands = horizons[:BANDED_HORIZONS]
         shown = [name if i else f"in 90 % band, {name}" for i, name in enumerate(bands)]
@@ -123,7 +123,7 @@ class Proof(Displayed):
             cells = [[row["row"], *_errors(row, kind, of, far)] for row in rows if of in row[kind]]
             lines += [*_table([header, *cells]), ""] if cells else []
         lines += _scales([row for row in rows if row["row"] not in (NOISE_FLOOR, LAST_MEASUREMENT)])
-        lines += self.outliers.lines(how="every program finds them so")
+        lines += self.outliers.lines(how="every model finds them so")
         for note in self.notes:
             lines += textwrap.wrap(f"note: {note}", TEXT_WIDTH)
         return "\n".join(lines)
@@ -180,7 +180,11 @@ def verdict(found: Proof) -> str:
     likely, how = _ruling(found, name, changed)
     horizon = _far(found)
     errors = {key.of: change for key, change in changed.items() if key[::2] == ("measurement", found.horizons[horizon])}
-    parts = [f"log p(y) {how}{with_interval(likely.difference, likely.interval, 1, ' nats a drive')}"] if likely else []
+    parts = (
+        [f"log p(y) {how}{with_interval(likely.difference, likely.interval, 1, ' nats a trajectory')}"]
+        if likely
+        else []
+    )
     parts += [how] if how and not likely else []
     for of, change in errors.items():
         where = f" in {of}" if len(errors) > 1 and of else ""

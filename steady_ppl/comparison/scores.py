@@ -144,7 +144,7 @@ def judge_program(
     """Find the paths from the measurements alone, unless one is given; predict, and compare; errors as of `prove`."""
     program, known_start = problem.program, problem.known_start
     unseen = problem.without_truth()
-    require_linear(unseen, f"{name}: prove needs programs that can be linearised", " (`steady evaluate` takes any)")
+    require_linear(unseen, f"{name}: prove needs models that can be linearised", " (`steady evaluate` takes any)")
     with unchanged(program):
         try:
             with seeded(seed, "prove"):
@@ -186,7 +186,7 @@ def judge_constant_velocity(before: Judged) -> Judged | str:
     path = before.tracked.path(unseen.data)
     ahead = smooth(replace(unseen, program=found.program), replace(path, noise=torch.zeros_like(path.noise)))
     if bool(ahead.is_broken.any()):
-        return "it diverges on these drives"
+        return "it diverges on these trajectories"
     return compare_predictions(replace(before.problem, program=found.program), ahead, before.horizons)
 
 
@@ -202,7 +202,7 @@ def noise_floor(true: Judged, seed: int) -> Judged | str:
     own = replace(unseen, data=again)
     ahead = smooth(own, path)
     if bool(ahead.is_broken.any()):
-        return "the true program does not fit drives of its own"
+        return "the true model does not fit trajectories of its own"
     if true.states:
         own = replace(own, data=replace(again, states=torch.where(again.rows.unsqueeze(-1), path.states, torch.nan)))
     return compare_predictions(own, ahead, true.horizons)

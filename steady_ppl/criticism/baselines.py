@@ -21,7 +21,7 @@ from steady_ppl.utils.angles import wrap
 
 NOISE_MULTIPLES = (0.5, 1.0, 2.0, 4.0, 8.0)  # of the channels' root mean squares, that are scanned
 DEFINITION = (
-    "the program with every channel's mean replaced by zero, so that it ignores the controls and keeps its velocity; "
+    "the model with every channel's mean replaced by zero, so that it ignores the controls and keeps its velocity; "
     "its channel noise is the one of a scan under which these measurements are most likely"
 )
 
@@ -93,12 +93,12 @@ def constant_velocity(problem: Problem, tracked: Tracked, horizons: Sequence[int
     spread = joined(spreads, seen.distributions, left)
     sizes = (values.double().square() + spread.double().square())[data.transitions].mean(0).sqrt()
     if not bool((sizes > 0).all() and torch.isfinite(sizes).all()):
-        return "a channel of the program never moves"
+        return "a channel of the model never moves"
     moved = mean_step(program, path.states[:-1], *inputs)
     kind = type("ConstantVelocity", (ConstantVelocity,), {})  # kernels take the inner program's parameters as constants
     coasted = mean_step(kind(program, sizes), path.states[:-1], *inputs)
     if bool(((moved - coasted).abs() <= 1e-6 * moved.abs().amax((0, 1))).all()):
-        return "the program's channels have no mean that could be taken away"
+        return "the model's channels have no mean that could be taken away"
     best: tuple[float, ConstantVelocity, Tracked] | None = None
     for multiple in NOISE_MULTIPLES:
         coasting = kind(program, multiple * sizes)
@@ -108,7 +108,7 @@ def constant_velocity(problem: Problem, tracked: Tracked, horizons: Sequence[int
         if math.isfinite(likely) and (best is None or likely > best[0]):
             best = likely, coasting, found
     if best is None:
-        return "it diverges on these drives"
+        return "it diverges on these trajectories"
     likely, coasting, found = best
     return Reference(coasting, likely, predict(coasting, data, found, horizons))
 

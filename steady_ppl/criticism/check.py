@@ -45,10 +45,12 @@ from steady_ppl.utils.random import seeded
 CHECK_HORIZONS = 2  # times ahead, besides one step
 MAX_ROWS_OF_DRAWS = 60_000  # rows times draws of the parameters, each of which is simulated by itself
 BANDS_HOLD = (
-    "these drives are not those of the fit: bands hold what its own drives leave open of its parameters as well"
+    "these trajectories are not those of the fit: bands hold what the fit's own leave open of its parameters as well"
 )
-TAKEN_AS_EXACT = "parameters are taken as exact: the fit does not say how well its drives determine them"
-BANDS_HOLD_NOT = "parameters are taken as exact: within what the fit's drives leave open of them the program diverges"
+TAKEN_AS_EXACT = "parameters are taken as exact: the fit does not say how well its trajectories determine them"
+BANDS_HOLD_NOT = (
+    "parameters are taken as exact: within what the fit's trajectories leave open of them the model diverges"
+)
 MAX_RESIDUAL_SD = 4.0  # of a single residual; beside a landmark the linearised program knows no more
 
 
@@ -66,18 +68,19 @@ def check(
     """Compare a fitted program with measurements.
 
     Args:
-        fit: the program, its noise normal; with its `known_start` the drives' first x. columns are used, nothing else
-            of the truth ever is, but to see whether the table itself has stretches that nobody measured.
-        data: drives, best those that were not used for the fit.
-        simulations: sets of drives to simulate for the bands.
-        horizons: seconds ahead, besides one step; those that suit the drives where none is given, see `data.horizons`.
-        has_seen: whether the fit is of these drives, so that its parameters' uncertainty does not count; None: if it
-            is of drives on which the same was measured.
+        fit: the program, its noise normal; with its `known_start` the trajectories' first x. columns are used, nothing
+            else of the truth ever is, but to see whether the table itself has stretches that nobody measured.
+        data: trajectories, best those that were not used for the fit.
+        simulations: sets of trajectories to simulate for the bands.
+        horizons: seconds ahead, besides one step; those that suit the trajectories where none is given, see
+            `data.horizons`.
+        has_seen: whether the fit is of these trajectories, so that its parameters' uncertainty does not count; None: if
+            it is of trajectories on which the same was measured.
         seed: of the simulation.
 
     Raises:
         UsageError: the program's noise is not normal, or there are too few simulations.
-        DataError: nothing to compare, a drive that is too long (`refuse_long`), or no known start.
+        DataError: nothing to compare, a trajectory that is too long (`refuse_long`), or no known start.
         FilterError: the linearised program broke down.
 
     Example:
@@ -92,12 +95,12 @@ def check(
     if run.time.shape[0] < 2 or not bool(run.observed[1:].any()):
         raise DataError("nothing to compare: no trajectory has a measurement after its first row")
     refuse_long(run)
-    require_linear(problem, "check needs a program that can be linearised")
+    require_linear(problem, "check needs a model that can be linearised")
     known = fit.information if fit.information is not None and fit.information.suits(program) else None
     ahead_by = named_horizons(run, CHECK_HORIZONS, horizons) if horizons else {}  # a wrong one is refused at once
     if has_seen is None:
         has_seen = known is not None and known.has_seen(run)
-    parts = (("finding paths", 1), ("comparing time steps", 1), ("simulating drives", 2), ("judging", 2))
+    parts = (("finding paths", 1), ("comparing time steps", 1), ("simulating trajectories", 2), ("judging", 2))
     with stages(*parts) as begin:
         begin()
         with seeded(seed, "check"), kernel_failures() as uncompiled:
@@ -131,17 +134,17 @@ def check(
     if known is not None and not has_seen:
         seen = len(known.drives.intersection(problem.data.digests))
         notes.append(BANDS_HOLD if is_open else BANDS_HOLD_NOT)
-        notes += [f"{seen} of these drives are the fit's own, and count as others here"] if seen else []
+        notes += [f"{seen} of these trajectories are the fit's own, and count as others here"] if seen else []
     elif known is None and not has_seen and fit.recipe != "hand":
         notes.append(TAKEN_AS_EXACT)
     notes += fallback_notes(uncompiled) + run.uneven_steps + diagnose_units(program, run)
     notes += [outliers.note] if outliers.note else []
-    notes += [f"refitted to these drives, {step.note}"] if step.note else []
+    notes += [f"refitted to these trajectories, {step.note}"] if step.note else []
     notes += [step.uncompared] if step.uncompared else []
     if parameters.names:
         notes += undetermined(problem, path)
     else:
-        notes.append("the program's own parameters were not looked at one by one: it has none, or a network's")
+        notes.append("the model's own parameters were not looked at one by one: it has none, or a network's")
     return Check(
         program=program,
         data=run,

@@ -74,7 +74,7 @@ def simulate_sets(
     sets = sum(len(tensors["values"]) for tensors, _ in blocks)
     if sets < MIN_BAND_SETS:
         what = f"{len(starts) - sets} of {len(starts)} simulated sets blew up"
-        raise FilterError(f"{what}: the fitted program does not even explain drives of its own")
+        raise FilterError(f"{what}: the fitted model does not even explain trajectories of its own")
 
     def of_blocks(name: str) -> Tensor:
         return torch.cat([tensors[name] for tensors, _ in blocks])

@@ -131,8 +131,8 @@ def misfit_of(
     found = list(_all_cells(both, time, controls, pairs))
     if not (cells := [cell for cell, _ in found]):
         rows, drives = time.shape
-        what = f"{drives} drives of at most {rows} intervals hold no place, time or regime"
-        raise DataError(f"{what} with enough residuals to average: take more drives, or longer ones")
+        what = f"{drives} trajectories of at most {rows} intervals hold no place, time or regime"
+        raise DataError(f"{what} with enough residuals to average: take more trajectories, or longer ones")
     average = np.stack([average for _, average in found], -1)  # (1 + M, cells)
     squares, typical = both.mean_squares, both.mean_squares[1:].mean(0)
     dispersion = np.divide(squares, typical, out=np.full_like(squares, np.nan), where=typical > 0)

@@ -30,7 +30,7 @@ VERDICTS = {  # the verdict; and what stands out as well, which is no verdict wh
     "dynamics": ("the dynamics are wrong", "the dynamics stand out"),
     "noise": ("the noise is wrong", "the noise stands out"),
     "parameters": ("the parameters are wrong", ""),
-    "cannot tell": ("these drives cannot tell which part is wrong", ""),
+    "cannot tell": ("these trajectories cannot tell which part is wrong", ""),
 }
 
 
@@ -40,22 +40,22 @@ class Check(Displayed):
 
     Attributes:
         program: that was judged.
-        data: the drives, as the program reads them, without outliers.
+        data: the trajectories, as the program reads them, without outliers.
         path: near their posterior means.
         horizons: name → how many rows ahead, "one step" first.
         predictions: horizon → measured less predicted.
         floor: horizon → RMSE of each component in each simulated set, `(M, K)`, see `floor_name`.
         reference: the vehicle that keeps its velocity, or why there is none.
         held: horizon → measured less last measured, and where both exist.
-        step: the program beside itself at finer steps, refitted to these drives.
+        step: the program beside itself at finer steps, refitted to these trajectories.
         misfit: the maps; every cell with its residual.
         blame: which part is wrong.
         residuals: names of the measurement components and, after them, of the channels.
         standardised: the residuals themselves, one set, with the variables that the regimes are ranges of.
         stuck: stretches of the table in which nothing was measured though something is written.
         outliers: readings that no noise of the sensors explains; nothing else is about them.
-        information: how well the drives of its fit determine the program's parameters; None where nobody said.
-        is_open: whether bands hold what these leave open, for it was not fitted to the drives that are checked.
+        information: how well the trajectories of its fit determine the program's parameters; None where nobody said.
+        is_open: whether bands hold what these leave open, for it was not fitted to the trajectories that are checked.
         notes: what was left out.
     """
 
@@ -131,7 +131,7 @@ class Check(Displayed):
                 table.append([with_unit(name, component["unit"]), horizon, *cells, f"{row['coverage_90']:.1%}"])
         lines = [content["verdict"], "", *aligned(table, left=(0, 1))]
         ratios = ", ".join(f"{name} {value:.2f}" for name, value in content["evidence"]["scatter"].items())
-        lines += ["", f"mean squares over those of simulated drives (nearly blind to a missing effect): {ratios}"]
+        lines += ["", f"mean squares over those of simulated trajectories (nearly blind to a missing effect): {ratios}"]
         total, cells = len(content["findings"]), content["cells"]
         lines += ["", f"{total} of {cells} cells are outside their simulated bands (false discoveries held at 5 %)"]
         lines += [f"  {finding['z']:+6.1f} sd  {finding['text']}" for finding in strongest(content["findings"])]
@@ -241,12 +241,13 @@ def verdict(found: Check) -> str:
     if blame.kind == "nothing found":
         drives, alone = len(found.data), len(found.misfit.significant)
         where = "in no place, time or regime more than" if not alone else "over all tests no more than"
-        said = f"Nothing found: on {'this drive' if drives == 1 else f'these {drives} drives'} the program errs {where}"
-        said += " on simulated drives of its own, which is no proof"
+        which = "this trajectory" if drives == 1 else f"these {drives} trajectories"
+        said = f"Nothing found: on {which} the model errs {where}"
+        said += " on simulated trajectories of its own, which is no proof"
         said += f" ({alone} of {len(found.misfit.cells)} cells would stand out by themselves)" if alone else ""
         said += "; `steady discover` says what could not have been seen"
     else:
-        said = "The program does not fit these drives: "
+        said = "The model does not fit these trajectories: "
         if blame.p_values["parameters"] <= blame.level:
             (fault, _), (_, beside) = VERDICTS["parameters"], VERDICTS[blame.kind]
             said += f"{fault}{_parameters(blame)}{_of_fit(found.information)}"
@@ -272,14 +273,14 @@ def _of_fit(fitted: ParameterInformation | None) -> str:
     if fitted is None:
         return f": {again}"
     if _is_done(fitted):
-        return ", although the fit has converged: these drives are of another vehicle, or an effect is missing"
+        return ", although the fit has converged: these trajectories are of another vehicle, or an effect is missing"
     return f", and the fit has not converged (a longer one gains {fitted.gain:.2g} nats, linearised): {again}"
 
 
 def _most_clearly(blame: Attribution) -> str:
     if blame.kind == "noise":
         name = max(blame.noise, key=lambda name: abs(blame.noise[name]))
-        return f", most clearly the {name}, {'more' if blame.noise[name] > 0 else 'less'} than the program says"
+        return f", most clearly the {name}, {'more' if blame.noise[name] > 0 else 'less'} than the model says"
     if blame.kind == "cannot tell":
         close = sorted(blame.explained, key=lambda kind: -blame.explained[kind])[:2]
         alike = len(close) == 2 and min(blame.explained[kind] for kind in close) > 3
@@ -311,7 +312,7 @@ def sentence(found: Check, finding: SignificantCell) -> str:
     if cell.map == "lag":
         return f"the misfit of {name} goes {'with' if more else 'against'} {where}"
     if cell.residual >= len(found.program.measurements):
-        return f"{name} {'above' if more else 'below'} the program's{where}"
+        return f"{name} {'above' if more else 'below'} the model's{where}"
     size = f"{abs(cell.mean or 0.0):.2g} {found.program.measurement_units[cell.residual]} ".replace("  ", " ")
     return f"{name} measured {size}{'above' if (cell.mean or 0.0) > 0 else 'below'} its prediction{where}"
 
@@ -327,7 +328,7 @@ def place(found: Check, cell: Cell) -> str:
     words = []
     for key, value in cell.where.items():
         if key == "drive":
-            words.append(f"on drive {found.data.labels[value]}")
+            words.append(f"on trajectory {found.data.labels[value]}")
         elif key == "time":
             words.append(f"between {value[0]:.1f} and {value[1]:.1f} s")
         else:

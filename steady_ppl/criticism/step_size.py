@@ -114,7 +114,7 @@ class StepCheck:
             said = f"move {suited.largest_difference(own)}"
         else:
             return ""
-        return f"the program's own time step is too coarse: {self._finer_steps(said)}"
+        return f"the model's own time step is too coarse: {self._finer_steps(said)}"
 
     @property
     def note(self) -> str:
@@ -279,7 +279,7 @@ def _trial(program: Program, data: Trajectories, maximum: Maximum, watched: Sequ
     )
     most = MAX_NATS_A_NUMBER * int(data.observed.sum())
     if not bool(maximum.information.isfinite().all()) or in_own_spread > most:
-        raise FilterError("its likelihood has no maximum on these drives: a standard deviation goes to zero")
+        raise FilterError("its likelihood has no maximum on these trajectories: a standard deviation goes to zero")
     found = StepTrial(program.substeps, likely, decrement, program, maximum.path)
     if not (chosen := {i: part for i, part in enumerate(elements(program)) if part.owner in watched}):
         return found

@@ -30,8 +30,9 @@ class Stretch:
     def __str__(self) -> str:
         begin, end = self.seconds
         return (
-            f"drive {self.label} between {begin:.2f} and {end:.2f} s: {', '.join(self.columns)} on a straight line, "
-            "as if a gap had been filled by interpolation or the sensor hung; nothing that is compared there was seen"
+            f"trajectory {self.label} between {begin:.2f} and {end:.2f} s: {', '.join(self.columns)} on a straight "
+            "line, as if a gap had been filled by interpolation or the sensor hung; nothing that is compared there was "
+            "seen"
         )
 
 

@@ -113,7 +113,7 @@ class Columns:
     def dropping(self, name: str) -> str:
         """The line that leaves a column out; advice where a program reads it."""
         if name in self.units:
-            return "the program reads it: look whether the log has it under another name, or take it out of both"
+            return "the model reads it: look whether the log has it under another name, or take it out of both"
         return f"table = table.drop(columns={json.dumps(name, ensure_ascii=False)})"
 
     def is_angle(self, name: str) -> bool:
@@ -151,7 +151,7 @@ def _runs(table: Columns) -> Iterator[Suspicion]:
         why = "its rows are in several places, between those of others"
         mend = 'table = table.sort_values(["trajectory", "time"], kind="stable")'
         if _restarts(table, again):
-            why = "its rows are in several places, and its time begins again there: one label for several drives"
+            why = "its rows are in several places, and its time begins again there: one label for several trajectories"
             mend = NEW_LABELS
         yield Suspicion("apart", None, again, int(rows[list(again)].sum()), why, mend)
     yield from _shared(table)
@@ -191,7 +191,9 @@ def _shared(table: Columns) -> Iterator[Suspicion]:
         shared = tuple(dict.fromkeys(owner[several]))
         count = int(several.sum()) + len(shared) * (MIN_SHARED_ROWS - 1)
         why = f"{count} rows say exactly what rows of another trajectory say: they overlap, or one is a copy"
-        mend = "keep each row in one trajectory: overlapping drives count twice, and a test on a copy tests nothing"
+        mend = (
+            "keep each row in one trajectory: rows that are there twice count twice, and a test on a copy tests nothing"
+        )
         yield Suspicion("overlap", None, shared, count, why, mend)
 
 
@@ -213,7 +215,7 @@ def _times(table: Columns) -> Iterator[Suspicion]:
         if repeats and count > MAX_REPEATED_TIMES * len(table.time):
             mend = "the stamps are coarser than the rows: take finer ones, or spread those that are equal evenly"
         elif not repeats and bool((np.abs(lengths) <= np.abs(table.time[rows.nonzero()[0] - 1] - starts) / 2).all()):
-            why += ": the time begins again, one label for several drives"
+            why += ": the time begins again, one label for several trajectories"
             mend = NEW_LABELS
         yield Suspicion("time", "time", table.within(rows), count, why, mend)
     step, first = float(np.median(steps[steps > 0])) if (steps > 0).any() else 0.0, float(np.nanmin(table.time))
@@ -224,7 +226,7 @@ def _times(table: Columns) -> Iterator[Suspicion]:
         unit = next(((name, by) for least, name, by in LONG_STEPS if step >= least), None)
         told = f"rows are {step:.3g} apart"
         if unit is None and MAX_STEP_RATIO[0] < ratio < MAX_STEP_RATIO[1]:
-            unit, told = ("milliseconds", 1e3), f"rows are {step:.3g} apart, steps of the program {table.step:g} s"
+            unit, told = ("milliseconds", 1e3), f"rows are {step:.3g} apart, steps of the model {table.step:g} s"
     if unit is not None:
         name, by = unit
         why = f"{told}: are these {name}? The table's times are seconds"

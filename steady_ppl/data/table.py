@@ -283,11 +283,11 @@ def fail(
 
 
 def from_arrays(drives: Sequence[Mapping[str, Any]], labels: Sequence[str] | None = None) -> Trajectories:
-    """The trajectories of arrays: for each drive its columns `time`, `u.…`, `y.…` and, where known, `x.…`.
+    """The trajectories of arrays: for each trajectory its columns `time`, `u.…`, `y.…` and, where known, `x.…`.
 
     Args:
         drives: column → `(rows,)`, or `(rows, K)` for the columns `…_0` to `…_K-1`; NaN is an empty cell.
-        labels: the drives' names, 1, 2, … when not given.
+        labels: the trajectories' names, 1, 2, … when not given.
 
     Raises:
         DataError: naming the column, the trajectory and the row.
@@ -300,9 +300,9 @@ def from_arrays(drives: Sequence[Mapping[str, Any]], labels: Sequence[str] | Non
     """
     labels = [str(i + 1) for i in range(len(drives))] if labels is None else list(labels)
     if not drives or len(labels) != len(drives):
-        raise DataError(f"arrays: got {len(drives)} drives and {len(labels)} labels")
+        raise DataError(f"arrays: got {len(drives)} trajectories and {len(labels)} labels")
     if repeated := sorted({label for label in labels if labels.count(label) > 1}):
-        raise DataError(f"arrays: {len(drives)} drives need {len(drives)} labels, and {repeated[0]} is there twice")
+        raise DataError(f"arrays: {len(drives)} trajectories need as many labels, and {repeated[0]} is there twice")
     frames = []
     for label, drive in zip(labels, drives, strict=True):
         columns: dict[str, np.ndarray] = {}
@@ -334,7 +334,7 @@ def refuse_long(data: Trajectories) -> None:
 
 
 def cut(data: Trajectories, seconds: float) -> Trajectories:
-    """Return the same drives in pieces of some seconds: one that is longer becomes `…-1`, `…-2`, …
+    """Return the same trajectories in pieces of some seconds: one that is longer becomes `…-1`, `…-2`, …
 
     Each piece begins at its first row that has a measurement; pieces of one row or without a measurement are left out.
     Time stays as recorded.

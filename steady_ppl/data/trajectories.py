@@ -96,19 +96,19 @@ class Trajectories(Displayed):
         return float(self.time.diff(dim=0)[self.transitions].median())
 
     def rows_ahead(self, seconds: float) -> int:
-        """How many rows make up a time, at the median step of all drives."""
+        """How many rows make up a time, at the median step of all trajectories."""
         return round(seconds / self.median_step)
 
     @property
     def uneven_steps(self) -> list[str]:
-        """What is to be said of times ahead where drives are sampled at different rates; they are counted in rows."""
+        """What to say of times ahead where trajectories are sampled at different rates; they are counted in rows."""
         steps = torch.where(self.transitions, self.time.diff(dim=0), torch.nan).nanmedian(0).values
         least, most = float(steps.min()), float(steps.max())
         if most < MAX_STEP_RATIO * least:
             return []
         return [
-            f"the drives' steps differ, {least:.3g} to {most:.3g} s: a time ahead is so many rows of "
-            f"{self.median_step:.3g} s in every drive; bring the table to one step, or judge its parts by themselves"
+            f"the trajectories' steps differ, {least:.3g} to {most:.3g} s: a time ahead is so many rows of "
+            f"{self.median_step:.3g} s in each of them; bring the table to one step, or judge its parts by themselves"
         ]
 
     @property
@@ -156,14 +156,14 @@ class Trajectories(Displayed):
         return replace(self, observed=observed, measurements=torch.where(observed, self.measurements, 0.0))
 
     def continued(self, controls: Tensor, step: float | None = None) -> Trajectories:
-        """The drives with rows after their ends in which nothing is measured: what is planned, to be forecast.
+        """The trajectories with rows after their ends in which nothing is measured: what is planned, to be forecast.
 
         Args:
-            controls: `(H, U)` for all drives, or `(H, B, U)`; the first acts from each drive's last row on.
+            controls: `(H, U)` for all trajectories, or `(H, B, U)`; the first acts from each trajectory's last row on.
             step: s between the new rows; the median step when None.
 
         Raises:
-            DataError: other numbers of drives or controls than the table has, or no step forward in time.
+            DataError: other numbers of trajectories or controls than the table has, or no step forward in time.
         """
         step = self.median_step if step is None else step
         plan = torch.as_tensor(controls).to(self.controls)

@@ -58,7 +58,7 @@ MIN_GAIN_OF_PLACE = 0.3  # nats by which another knee or place has to be likelie
 MAX_COORDINATE_SWEEPS = 4  # along all knees and places in turns, with steps of one size
 MAX_STEPS_OF_PLACE = 4  # in one direction of one of them, one after another
 MAX_NATS_BY_ONE_FOLD = 3.0  # by which one fold may like another place better, to make up for what the other loses
-NOT_SIMULATED = "with it too many simulated drives diverge"
+NOT_SIMULATED = "with it too many simulated trajectories diverge"
 NEIGHBOUR_SHARE = 0.25  # of the grid's spacing, at which a place's likelihood is compared with its neighbours'
 
 
@@ -174,7 +174,7 @@ def screen_program(
     columns = [column for column, scores in zip(columns, found, strict=True) if not isinstance(scores, str)]
     observed = torch.cat([own, *(scores for scores in found if not isinstance(scores, str))], -1)
     if broken := (~torch.isfinite(own).all(-1)).nonzero().flatten().tolist():
-        raise FilterError(f"trajectory {fold.drives.labels[broken[0]]}: the fitted program diverges on it")
+        raise FilterError(f"trajectory {fold.drives.labels[broken[0]]}: the fitted model diverges on it")
     starts = fold.path.states[0].expand(sets, -1, -1)  # known, or draws of their posterior
     if not fold.known_start:
         with seeded(seed, "starts"):

@@ -48,8 +48,8 @@ Later = TypeVar("Later")
 
 MAX_UNREPORTED_GAIN = 10.0  # nats that fitting a run further may gain before it is said
 MIN_SETS = 50  # simulated sets for the calibration
-COMPARING, PROPOSING = "comparing before and after", "looking for a better next drive"
-NOT_CONVERGED = "the program's own fit has not converged: no ranking below is to be trusted"
+COMPARING, PROPOSING = "comparing before and after", "looking for a better next trajectory"
+NOT_CONVERGED = "the model's own fit has not converged: no ranking below is to be trusted"
 
 
 @one_thread()
@@ -68,21 +68,21 @@ def discover(
 ) -> Discovery:
     """Find the physical effects that a program lacks.
 
-    Every effect of the catalogue is tested at once and the test calibrated by simulated drives; the leaders are fitted
-    and chosen by log p(y) of drives that they were not fitted to; so on until the tests are quiet. An interrupt
-    (Ctrl-C) after the first tests ends the search with what it has found, and `search.interrupted` says so.
+    Every effect of the catalogue is tested at once and the test calibrated by simulated trajectories; the leaders are
+    fitted and chosen by log p(y) of trajectories that they were not fitted to; so on until the tests are quiet. An
+    interrupt (Ctrl-C) after the first tests ends the search with what it has found, and `search.interrupted` says so.
 
     Args:
         program: a program or a fit of one, with normal noise and at most some dozens of learnable numbers; it is not
             changed, and fitted first.
-        train: drives to test and fit.
-        valid: drives to choose by; every second drive of `train` when None.
+        train: trajectories to test and fit.
+        valid: trajectories to choose by; every second trajectory of `train` when None.
         known_start: take the first row's x. columns as the exact start; a fit's own setting when None.
-        mix: put both tables together and keep every second drive to choose by; for tables that are not alike, one of
-            them with rougher drives.
+        mix: put both tables together and keep every second trajectory to choose by; for tables that are not alike, one
+            of them with rougher trajectories.
         declared: the program with the noise scales that its owner believes; the program's class afresh when a fit is
             given, else `program`.
-        simulations: sets of drives for the calibration, at least 50.
+        simulations: sets of trajectories for the calibration, at least 50.
         withheld: names of effects to leave out of the catalogue.
         only: the kinds of effects to look for (dynamics, actuator, sensor, noise); all of them where none is named.
         seed: of the simulated sets.
@@ -90,7 +90,7 @@ def discover(
     Raises:
         UsageError: a network, a program that cannot be linearised, too few simulations, no such effect to leave out, no
             such kind, or one table to mix.
-        DataError: too few drives, no known start, or controls that identify nothing.
+        DataError: too few trajectories, no known start, or controls that identify nothing.
         FilterError: the program cannot be fitted.
 
     Example:
@@ -117,7 +117,7 @@ def discover(
     settings = Settings(declared, simulations, seed=seed, withheld=withheld, only=only)
     if not any(map(settings.wants, catalogue(program))):
         kind = f"of {' and '.join(only)} that" if only else "that"
-        raise UsageError(f"nothing to look for: no effect {kind} is not withheld applies to the program")
+        raise UsageError(f"nothing to look for: no effect {kind} is not withheld applies to the model")
     notes: list[str] = []
     if mix:
         if valid is None:
@@ -126,13 +126,13 @@ def discover(
     if valid is None:
         if len(train) < 2 * MIN_DRIVES:
             raise DataError(
-                f"{len(train)} drives are too few: {2 * MIN_DRIVES} are needed, half of them to choose by, because "
-                "the unit that is resampled is the drive"
+                f"{len(train)} trajectories are too few: {2 * MIN_DRIVES} are needed, half of them to choose by, "
+                "because the unit that is resampled is the trajectory"
             )
         valid = train.subset(range(1, len(train), 2))
         train = train.subset(range(0, len(train), 2))
-        kept = f"{len(valid)} of the {len(train) + len(valid)} drives were kept to choose by"
-        notes.append(f"the tables were mixed: {kept}" if mix else f"no validation drives were given: {kept}")
+        kept = f"{len(valid)} of the {len(train) + len(valid)} trajectories were kept to choose by"
+        notes.append(f"the tables were mixed: {kept}" if mix else f"no validation trajectories were given: {kept}")
     problem, choosing = (Problem.of_table(program, table, known_start) for table in (train, valid))
     require_searchable(problem, choosing.data, simulations)
     with stages(("", 8), (COMPARING, 1), (PROPOSING, 1)) as begin:
@@ -169,7 +169,7 @@ def _searched(problem: Problem, valid: Trajectories, settings: Settings) -> Sear
     try:
         return search(problem, valid, settings)
     except (ArithmeticError, ValueError, torch.linalg.LinAlgError) as error:  # type: ignore[attr-defined]
-        raise FilterError(f"the program cannot be searched on these drives: {reason_of(error)}") from error
+        raise FilterError(f"the model cannot be searched on these trajectories: {reason_of(error)}") from error
 
 
 def _afterwards(compute: Callable[[], Later], found: Search, doing: str, notes: list[str]) -> Later | None:
@@ -197,7 +197,7 @@ def _fit_to_all(refit: Refit, found: Search, drives: frozenset[str], settings: S
         notes.extend(note for note in why if note not in notes)
         return None if kept is None else replace(kept, drives=drives)
 
-    information = _afterwards(known, found, "looking at what the drives tell of the parameters", notes)
+    information = _afterwards(known, found, "looking at what the trajectories tell of the parameters", notes)
     said = {"simulations": settings.sets, "seed": settings.seed}
     trained = Trained([], kept=0, interrupted=True) if found.interrupted else None
     return Fit(program, "discover", said, settings.seed, fold.known_start, trained, information=information)
@@ -206,7 +206,7 @@ def _fit_to_all(refit: Refit, found: Search, drives: frozenset[str], settings: S
 def _proposed(largest: Found, seed: int, notes: list[str]) -> NextRun | None:
     if (proposed := next_run(largest, seed)) is None:
         both = " from ".join(candidate.variant.name for candidate in largest.aliases[:2])
-        notes.append(f"no way of driving that was tried tells {both} better than these drives do")
+        notes.append(f"no way of driving that was tried tells {both} better than these trajectories do")
     return proposed
 
 
@@ -216,9 +216,9 @@ def _doubts(found: Search, is_fitted: bool) -> list[str]:
         doubts.append(f"interrupted while {found.interrupted}: this is what had been found until then")
     if is_fitted and found.gained > MAX_UNREPORTED_GAIN:
         doubts.append(
-            f"the run had not converged: fitting it further gained {found.gained:.0f} nats on these drives, before "
-            "anything was added. What follows begins from there; `steady prove` against the run would count them as "
-            "gains"
+            f"the run had not converged: fitting it further gained {found.gained:.0f} nats on these trajectories, "
+            "before anything was added. What follows begins from there; `steady prove` against the run would count "
+            "them as gains"
         )
     statistic, count = found.rounds[0].screening.tests.fitted
     if count and statistic > 5 * count + 10:
@@ -240,8 +240,8 @@ def _notes(found: Search) -> list[str]:
     notes = []
     if isinstance(found.base.fitting, ByDraws):
         notes.append(
-            "the linearised program's log p(y) is off by more than half a nat a drive, or cannot be judged: fits are "
-            "gradient steps on draws, judged by particles, and whether they have converged is not tested"
+            "the linearised model's log p(y) is off by more than half a nat a trajectory, or cannot be judged: fits "
+            "are gradient steps on draws, judged by particles, and whether they have converged is not tested"
         )
     if constant := unexcited(found.base.program, found.base.folds[0].drives):
         notes.append(f"{', '.join(constant)} never changes: what it does cannot be told from what happens anyway")
@@ -251,13 +251,13 @@ def _notes(found: Search) -> list[str]:
         notes.append(found.step.uncompared)
     if found.curve is not None:
         notes.append(
-            "a curve has no name and is not kept: 'after' is what it would bring, --out has the program as it stood, "
-            "fitted, with the noise that these drives show"
+            "a curve has no name and is not kept: 'after' is what it would bring, --out has the model as it stood, "
+            "fitted, with the noise that these trajectories show"
         )
     notes += [one.note for one in found.outliers if one.note] + found.notes
     if not found.final.converged and found.found:
         notes.append("the fit with what was found has not converged")
-    notes += [f"{label}: taken back, for with it the program fails: {why}" for label, why in found.taken_back.items()]
+    notes += [f"{label}: taken back, for with it the model fails: {why}" for label, why in found.taken_back.items()]
     if found.is_full:
         notes.append(f"the search stops at {MAX_EFFECTS} effects: add them, fit, and discover again from there")
     if not found.is_complete and not found.cut_short:
@@ -281,8 +281,8 @@ def _not_wrong_after_all(found: Search) -> list[str]:
     if count <= 0.5 * before.cells:
         return []
     return [
-        f"{count} of {before.cells} readings of the training drives that were left out are not wrong by the program "
-        "with what was found: discover again from there"
+        f"{count} of {before.cells} readings of the training trajectories that were left out are not wrong by the "
+        "model with what was found: discover again from there"
     ]
 
 
@@ -292,8 +292,8 @@ def _note_of_one_drive(found: Found) -> str:
     if isinstance(refit, str) or found.candidate.total - float(gain.max()) > TIE_NATS:
         return ""
     held_out = [(name, fold.held_out) for name, fold in zip(("validation", "training"), refit.folds, strict=True)]
-    drives = [f"{label} of the {name} drives" for name, data in held_out for label in data.labels]
-    return f"without drive {drives[int(gain.argmax())]} nothing would be left of its gain: look at that drive"
+    drives = [f"{name} trajectory {label}" for name, data in held_out for label in data.labels]
+    return f"without {drives[int(gain.argmax())]} nothing would be left of its gain: look at it"
 
 
 def require_searchable(problem: Problem, valid: Trajectories, simulations: int) -> None:
@@ -303,28 +303,28 @@ def require_searchable(problem: Problem, valid: Trajectories, simulations: int) 
         raise UsageError(f"got {simulations} simulations: the calibration needs at least {MIN_SETS}, 200 are better")
     elements(program)
     if not program.channel_names:
-        raise UsageError("the program declares no noise channels, through which effects act")
+        raise UsageError("the model declares no noise channels, through which effects act")
     for name, drives in (("training", train), ("validation", valid)):
         if len(drives) < MIN_DRIVES:
             raise DataError(
-                f"{len(drives)} {name} drives are too few: each half needs at least {MIN_DRIVES}, because the unit "
-                "that is resampled is the drive"
+                f"{len(drives)} {name} trajectories are too few: each half needs at least {MIN_DRIVES}, because the "
+                "unit that is resampled is the trajectory"
             )
         if drives.time.shape[0] < 3 or not bool(drives.observed[1:].any()):
-            raise DataError(f"the {name} drives have no measurements after their first rows")
+            raise DataError(f"the {name} trajectories have no measurements after their first rows")
         refuse_long(drives)
     if both := shared_drives(train, valid):
         some = ", ".join(both[:3]) + (" …" if len(both) > 3 else "")
         raise UsageError(
-            f"{len(both)} of the validation drives are training drives as well ({some}): nothing could be judged "
-            "by them"
+            f"{len(both)} of the validation trajectories are training trajectories as well ({some}): nothing could be "
+            "judged by them"
         )
-    require_linear(problem, "discover needs a program that can be linearised")
+    require_linear(problem, "discover needs a model that can be linearised")
     constant = unexcited(program, train)
     if constant and len(constant) == len(program.control_names):
         raise DataError(
-            f"the controls never change ({', '.join(constant)}): these drives cannot tell what the controls do from "
-            "what happens anyway, and no verdict is given; record drives with changing controls"
+            f"the controls never change ({', '.join(constant)}): these trajectories cannot tell what the controls do "
+            "from what happens anyway, and no verdict is given; record trajectories with changing controls"
         )
 
 

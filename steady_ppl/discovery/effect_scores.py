@@ -264,7 +264,7 @@ def scores_along(
             scores = scoring(column)
         except Exception as error:  # also of the program's own code, on commands and states that nobody tried before
             return reason_of(error)
-        return scores if bool(torch.isfinite(scores).all()) else "it is not finite along these drives"
+        return scores if bool(torch.isfinite(scores).all()) else "it is not finite along these trajectories"
 
     return parameter_scores(*along, list(parts)), [tried(column) for column in columns]
 
@@ -309,7 +309,7 @@ def simulate_scores(
     whole = of_columns[kept].all(0)
     if int(whole.sum()) < MIN_SHARE_OF_FINITE_SETS * sets:
         raise FilterError(
-            f"{int((~whole).sum())} of {sets} simulated sets blew up: the fitted program does not even explain "
-            "drives of its own"
+            f"{int((~whole).sum())} of {sets} simulated sets blew up: the fitted model does not even explain "
+            "trajectories of its own"
         )
     return scores[whole]

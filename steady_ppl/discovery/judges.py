@@ -61,7 +61,7 @@ class ParticleJudge:
                 more = more if again is None else (more + again) / 2
         except Exception as error:  # also of the program's own code
             nothing = torch.full_like(candidate.gain, -math.inf)
-            reason = f"no particle filter follows the drives: {reason_of(error)}"
+            reason = f"no particle filter follows the trajectories: {reason_of(error)}"
             return replace(candidate, refit=reason, gain=nothing, alone=nothing, is_confirmed=True)
         if more is None or abs(float(more.sum())) <= NEGLIGIBLE_NATS:
             return replace(candidate, is_confirmed=True)

@@ -115,7 +115,7 @@ class Refit(Fits):
     held_out_alone: Tensor  # the same under the programs that were fitted to one fold alone
     unwidened: Program | None = None  # before its fit made its noise many times wider: fits begin there as well
     neglected: dict[int, Tensor | str] = field(default_factory=dict, init=False, repr=False, compare=False)
-    """What the linearised log p(y) neglects of each held-out drive, nats, or why no filter follows it, by its seed."""
+    """What the linearised log p(y) neglects of each held-out trajectory, nats, or why no filter follows it, by seed."""
 
     def coefficient(self, variant: Variant) -> Tensor:
         """An effect's, its mean over the folds: nearly that of a fit to all drives together."""

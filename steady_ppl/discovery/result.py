@@ -24,7 +24,7 @@ from steady_ppl.utils.text import TEXT_WIDTH, aligned, figure
 
 CANDIDATES_SHOWN = 12  # candidates in the table
 VERDICT_PHRASES = {
-    "none": "No effect is missing as far as these drives can tell",
+    "none": "No effect is missing as far as these trajectories can tell",
     "dynamics": "The dynamics lack",
     "actuator": "The actuators lack",
     "sensor": "The sensor has",
@@ -32,7 +32,7 @@ VERDICT_PHRASES = {
     "other": "Something is missing that is in no catalogue",
     "undecided": "Something is missing",
 }
-WRONG_NOISE = "These drives contradict the declared noise:"
+WRONG_NOISE = "These trajectories contradict the declared noise:"
 PAIR_FORM, NUMBERS_FORM = [NUMBER, NUMBER], (NUMBER, [(NUMBER, None)], None)
 CANDIDATE_FORM = {
     **dict.fromkeys(("effect", "kind", "unit"), TEXT),
@@ -71,12 +71,12 @@ class Discovery(Displayed):
         search: everything that was tested and fitted.
         findings: the effects that are missing, the one that brings most first, and then what the noise is where
             that was declared otherwise; of effects none where none or a curve is missing.
-        shape: the curve where no effect of the catalogue explains the drives.
+        shape: the curve where no effect of the catalogue explains the trajectories.
         next_run: controls that would separate the first class of several members; None where there is none, or where
             no way of driving that was tried does.
-        proof: the program before and after on the validation drives, by the fits to the training drives; None where
-            the search was interrupted, or where a note says why there is none.
-        before, after: the programs, fitted to all drives; they differ by what was found and by corrected noise.
+        proof: the program before and after on the validation trajectories, by the fits to the training trajectories;
+            None where the search was interrupted, or where a note says why there is none.
+        before, after: the programs, fitted to all trajectories; they differ by what was found and by corrected noise.
         doubts: why no ranking is to be trusted, empty as a rule.
         notes: what was left out or is not as it seems.
     """
@@ -102,7 +102,7 @@ class Discovery(Displayed):
 
     @property
     def p_value(self) -> float:
-        """Family-wise: how often drives of the fitted program would look as wrong somewhere."""
+        """Family-wise: how often trajectories of the fitted program would look as wrong somewhere."""
         return self.search.rounds[0].screening.tests.p_value
 
     @property
@@ -157,11 +157,11 @@ class Discovery(Displayed):
         lines += [line for name, found in wrong if found.found for line in ("", *found.lines(name))]
         lines += ["", *_table(self)]
         if run := self.next_run:
-            asked = f"To tell {' from '.join(run.between[:2])}, drive {run.way}: {run.separation:.1f} nats a drive, "
-            lines += ["", *textwrap.wrap(f"{asked}against {run.usual:.1f} of drives such as these.", TEXT_WIDTH)]
+            asked = f"To tell {' from '.join(run.between[:2])}, drive {run.way}: {run.separation:.1f} nats a trajectory"
+            lines += ["", *textwrap.wrap(f"{asked}, against {run.usual:.1f} of ones such as these.", TEXT_WIDTH)]
         notes = self.notes
         if self.proof is not None and self.verdict != "none":
-            lines += ["", "On the validation drives:", str(self.proof)]
+            lines += ["", "On the validation trajectories:", str(self.proof)]
             known = self.proof.notes
             notes = [note for note in notes if note not in known]
         return "\n".join(lines + [line for note in notes for line in textwrap.wrap(f"note: {note}", TEXT_WIDTH)])
@@ -252,7 +252,7 @@ def _note(tested: Tested, fitted: Candidate | None) -> str | None:
     if fitted.against_its_sign:
         return "its sign is one that physics rules out: a symptom"
     if not fitted.is_judged:
-        return "given up after half of the drives: its gain is extrapolated"
+        return "given up after half of the trajectories: its gain is extrapolated"
     return None if fitted.refit.converged else "its fit has not converged"
 
 
@@ -304,7 +304,7 @@ def _verdict(found: Discovery, effects: Sequence[Finding]) -> str:
         undecided = VERDICT_PHRASES["undecided"]
         return f"{undecided} {p_value}; the search was interrupted before an effect was chosen."
     if not effects:
-        return f"{missing} {p_value}, and neither an effect nor a curve brings anything on held-out drives."
+        return f"{missing} {p_value}, and neither an effect nor a curve brings anything on held-out trajectories."
     clauses: list[str] = []
     for kind in dict.fromkeys(finding.kind for finding in effects):
         said = [_said(finding, found.search.is_complete) for finding in effects if finding.kind == kind]
@@ -324,7 +324,7 @@ def _said(finding: Finding, is_complete: bool) -> str:
     numbers = ", ".join(f"{value:.3g} [{low:.3g}, {high:.3g}]" for value, (low, high) in pairs)
     said = f"{finding.variant.label} = {numbers}{unit}"
     if len(finding.aliases) > 1:
-        said += f", which these drives cannot tell from {' or '.join(finding.aliases[1:])}"
+        said += f", which these trajectories cannot tell from {' or '.join(finding.aliases[1:])}"
     if finding.confidence is None:
         return said
     if not is_complete:

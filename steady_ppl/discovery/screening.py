@@ -33,7 +33,7 @@ FAMILY_LEVEL, POWER = 0.05, 0.95  # of the tests of all candidates together, and
 MIN_SHARE_OF_INFORMATION = 1e-4  # of a column, that the fitted parameters must leave for it to be tested
 CONTAINED = "the fitted parameters already explain it"
 NOISE_SIZES = ("process_noise", "measurement_noise")  # the effects that multiply a standard deviation
-UNEXCITED = "these drives never excite it"
+UNEXCITED = "these trajectories never excite it"
 NOT_FINITE = "its test is not finite"
 MAX_NONCENTRALITY = 1e4  # of a detection limit's χ²
 

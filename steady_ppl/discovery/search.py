@@ -58,7 +58,7 @@ MAX_CURVES = 3  # adding curves that are fitted
 MAX_ROUNDS = MAX_EFFECTS + 3  # with factors on noise, which take no place, and a last test
 NOT_FINER = "what was found was not looked at in finer time steps: {}"
 COARSE = "what was found asks for {} substeps a row: all sizes are those of a step that is too coarse"
-NOTHING_TESTED = "the program as it stands was fitted, and no effect has been tested yet"
+NOTHING_TESTED = "the model as it stands was fitted, and no effect has been tested yet"
 
 
 @dataclass(frozen=True)
@@ -93,7 +93,7 @@ def search(problem: Problem, valid: Trajectories, settings: Settings) -> Search:
         return first_refit(Problem(program, train, problem.known_start), valid, seed=settings.seed, nearer=nearer)
 
     program = problem.program
-    with stages(("fitting the program as it stands", 1), ("comparing time steps", 1), ("", 8)) as begin:
+    with stages(("fitting the model as it stands", 1), ("comparing time steps", 1), ("", 8)) as begin:
         begin()
         own, suited, outliers, whole = without_outliers(partial(fit, program), problem.data, valid, settings.corrects)
         left, valid = (one.left for one in outliers)
@@ -143,7 +143,7 @@ def _require_resolved(base: Refit) -> None:
         if -likely * torch.finfo(fold.drives.measurements.dtype).eps > MIN_GAIN:
             label = fold.drives.labels[int(index)]
             raise FilterError(
-                f"trajectory {label}: its log p(y) is {float(likely):.2g} nats, too far down to compare programs: "
+                f"trajectory {label}: its log p(y) is {float(likely):.2g} nats, too far down to compare models: "
                 "`steady doctor` looks for wrong readings and units",
                 trajectory=label,
             )

@@ -46,7 +46,7 @@ def with_effect(
 def attach(program: Program, variant: Variant, value: Value | None = None, *, class_name: str | None = None) -> Program:
     """Add an effect to this very program, whose class is named after it and the effect without a `class_name`."""
     if variant.name in [known.name for known in attached(program)]:
-        raise UsageError(f"program {type(program).__name__} has the effect {variant.name} already")
+        raise UsageError(f"model {type(program).__name__} has the effect {variant.name} already")
     if hasattr(program, variant.parameter):  # a parameter of its own that has nothing to do with it
         variant = replace(variant, called=f"{variant.parameter}_effect")
     name, effect = variant.parameter, variant.effect

@@ -42,7 +42,7 @@ def write_program(program: Program, path: str | Path, *, force: bool = False) ->
     base, base_file = _base_of(program)
     class_name = _class_name(path, program, base, base_file, force)
     if not attached(program):
-        raise UsageError(f"program {type(program).__name__} has no effect that its file does not have")
+        raise UsageError(f"model {type(program).__name__} has no effect that its file does not have")
     values, notes = _carried_over(program, base)
     text = _program_text(program, class_name, base, base_file.stem, values)
     with whole_file(path, beside=path.with_name(f"partial_{path.name}")) as beside:
@@ -93,7 +93,7 @@ def _named(program: Program, variant: Variant) -> str:
     if home not in known and home.partition(".")[0] not in known:
         raise UsageError(
             f"effect {variant.name} is registered in {home}, which the new file would not load: register it in the "
-            "program's own file"
+            "model's own file"
         )
     return f"{variant.written}={','.join(_numbers(coefficient(program, variant).detach().flatten()))}"
 
@@ -126,7 +126,7 @@ def _carried_over(program: Program, base: type[Program]) -> tuple[list[str], lis
     others = {k: value for k, value in program.state_dict().items() if parameter_name(k) not in program._pyro_params}
     changed = [k for k, value in others.items() if k not in before or not torch.equal(value, before[k].to(value))]
     if modules := dict.fromkeys(name.partition(".")[0] for name in changed):
-        notes.append(f"not carried over, being too much for a program file: {', '.join(modules)}; fit them again")
+        notes.append(f"not carried over, being too much for a model file: {', '.join(modules)}; fit them again")
     return lines, notes
 
 
@@ -137,7 +137,7 @@ def _base_of(program: Program) -> tuple[type[Program], Path]:
     except (TypeError, OSError):
         file = Path()
     if not file.is_file() or "." in base.__qualname__:
-        raise UsageError(f"program {base.__name__} came from no file, so that no other file can derive from it")
+        raise UsageError(f"model {base.__name__} came from no file, so that no other file can derive from it")
     if not file.stem.isidentifier():
         raise UsageError(f"{file.name} cannot be imported by another file: name it in letters, digits and underscores")
     return base, file
@@ -149,12 +149,12 @@ def _class_name(path: Path, program: Program, base: type, base_file: Path, force
         raise UsageError(f"{path}: expected a name such as {base_file.stem}_with_drag.py")
     if path.resolve().parent != base_file.resolve().parent:
         raise UsageError(
-            f"{path}: the new program imports {base.__name__} from {base_file.name} and has to lie beside it: "
+            f"{path}: the new model imports {base.__name__} from {base_file.name} and has to lie beside it: "
             f"{os.path.relpath(base_file.parent / path.name)}"
         )
     files = {Path(inspect.getsourcefile(one) or "") for one in type(program).__mro__ if issubclass(one, Program)}
     if path.resolve() in {file.resolve() for file in files} or name == base.__name__:
-        raise UsageError(f"{path}: the new program derives from {base.__name__}: give it another name")
+        raise UsageError(f"{path}: the new model derives from {base.__name__}: give it another name")
     if path.exists() and not force:
         raise UsageError(f"{path} exists: choose another name, or --force to overwrite")
     return name

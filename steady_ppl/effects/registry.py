@@ -17,7 +17,7 @@ from steady_ppl.model.program import Program
 PAGE_HEAD = """# Effects
 
 What `steady effects` prints. `steady simulate MODEL --effect NAME[:AT][:OPTION=NUMBER][=NUMBER[,NUMBER]]` adds one to \
-a simulation, `steady add` writes it into a program, `program.with_effect(NAME, VALUE)` does so in Python. `c` is the \
+a simulation, `steady add` writes it into a model, `program.with_effect(NAME, VALUE)` does so in Python. `c` is the \
 coefficient; without a value it is the typical one.
 """
 _EFFECTS: list[Effect] = [*FORCES, *WHEELS, *ACTUATORS, *SENSORS, *NOISE]

@@ -51,7 +51,7 @@ class ReferencePath:
     states: Tensor  # (T + 1, B, D)
     noise: Tensor  # (T, B, C), in standard deviations of the channels
     variance: Tensor | None = None
-    """Of what each measurement sees, given all measurements, (T + 1, B, K); None of programs without Student t."""
+    """Of what each measurement sees, given all measurements, (T + 1, B, K); None of models without Student t."""
 
     @classmethod
     def of_means(

@@ -39,7 +39,7 @@ def fixes(program: Program, data: Trajectories, *, places: int = 32, passes: int
         with fewer measurements than components that they do depend on.
 
     Raises:
-        DataError: nothing is measured, or fewer than two rows of a drive have enough measurements.
+        DataError: nothing is measured, or fewer than two rows of a trajectory have enough measurements.
     """
     data = data.without_truth()
     _, made_up = simulate_again(program, data, draw_first_states(program, data, places, len(data)), noise_size(program))
@@ -67,7 +67,7 @@ def _require_enough(program: Program, data: Trajectories, told: Tensor, enough: 
         label = data.labels[drive]
         dependent = ", ".join(name for name, tells in zip(program.state_names, told.tolist(), strict=True) if tells)
         few = f"in fewer than two rows there are measurements enough, {int(told.sum())}"
-        what = f"{few}, to tell {dependent} from that row alone; leave such drives out"
+        what = f"{few}, to tell {dependent} from that row alone; leave such trajectories out"
         raise DataError(f"trajectory {label}: {what}", trajectory=label)
 
 

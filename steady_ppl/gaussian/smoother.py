@@ -197,10 +197,10 @@ def require_found(ahead: Lookahead, problem: Problem) -> None:
         label = problem.data.labels[drive]
         likely = float(ahead.log_likelihood[drive])
         why = divergence(problem.program, problem.data.subset([drive])) or (
-            f"the linearised program's log p(y), {likely:.4g} nats, is larger than its sensors allow: the filter has "
+            f"the linearised model's log p(y), {likely:.4g} nats, is larger than its sensors allow: the filter has "
             "broken down numerically"
             if math.isfinite(likely)
-            else "the linearised program's log p(y) is not finite: its parameters or states have blown up, or it "
+            else "the linearised model's log p(y) is not finite: its parameters or states have blown up, or it "
             "cannot be linearised there (--recipe steady --guide bootstrap does not)"
         )
         raise FilterError(f"trajectory {label}: {why}", trajectory=label)

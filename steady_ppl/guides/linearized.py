@@ -99,7 +99,7 @@ class LinearizedGuide(PathGuide):
     def _recall(self, kind: str, data: Trajectories) -> Tensor:
         known = [self.memory[f"{kind}/{label}"] for label in data.labels]
         if any(len(path) != len(data.time) - (kind == "noise") for path in known):
-            raise UsageError("this guide remembers other drives of the same labels: make a new one for these")
+            raise UsageError("this guide remembers other trajectories of the same labels: make a new one for these")
         return torch.stack(known, 1).to(data.controls)
 
     def remember(self, path: ReferencePath, data: Trajectories) -> None:
@@ -191,7 +191,7 @@ class SmootherGuide(VariationalGuide):
 
     def begin(self, data: Trajectories) -> Tensor:
         if unknown := [label for label in data.labels if label not in self.labels]:
-            raise UsageError(f"this guide has parameters for its own drives only, not for drive {unknown[0]}")
+            raise UsageError(f"this guide has parameters for its own trajectories only, not for {unknown[0]}")
         self.index = [self.labels.index(label) for label in data.labels]
         return super().begin(data)
 

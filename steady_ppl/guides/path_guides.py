@@ -58,7 +58,7 @@ class PathGuide:
         broken = ~torch.isfinite(self.paths.states).all(-1).all(0) & data.rows
         for row, drive in broken.nonzero()[:1].tolist():
             label, time = data.labels[drive], float(data.elapsed[row, drive])
-            what = f"trajectory {label} at {time:.3g} s: a state is not finite: the program has blown up"
+            what = f"trajectory {label} at {time:.3g} s: a state is not finite: the model has blown up"
             raise FilterError(what, trajectory=label, time=time)
 
     def __call__(self, data: Trajectories) -> None:
@@ -202,7 +202,7 @@ def true_paths(program: Program, data: Trajectories) -> Paths:
     else:
         what = "no channel noise was found that leads from one true state to the next"
         why = "(transition bends too much in its noise): supervised learning cannot tell which it was"
-        raise ProgramError(f"program {type(program).__name__}: {what} {why}", site="transition")
+        raise ProgramError(f"model {type(program).__name__}: {what} {why}", site="transition")
     ends, moving = run(noise)
     states = torch.cat([states[:1], torch.where(own, states[1:], ends.to(states))])
     with running(1, before.shape[1]), Recording() as start:

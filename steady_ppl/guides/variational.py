@@ -182,7 +182,7 @@ class AutoRollout(VariationalGuide):
         """Draw all noise at once; log q(ε) − log N(ε; 0, 1) of it, `(M,)`."""
         if data.labels != self.labels:
             why = "it takes no others and no batch"
-            raise UsageError(f"an automatic guide has parameters for each of its drives: {why}")
+            raise UsageError(f"an automatic guide has parameters for each of its trajectories: {why}")
         names, normal = list(self._shapes(data)), dist.Normal(0.0, 1.0)
         with pyro.settings.context(module_local_params=True), poutine.block():
             traces = [poutine.trace(self.auto).get_trace(data) for _ in range(self.draws)]
@@ -213,7 +213,7 @@ class AutoRollout(VariationalGuide):
 
 
 class InferenceNetwork(VariationalGuide):
-    """What a drive's later measurements say of its noise, learned for all drives at once.
+    """What a trajectory's later measurements say of its noise, learned for all trajectories at once.
 
     Backward in time a recurrent network reads measurements and controls. Its code, of all rows at once, is turned with
     the interval's own control and step into a proposal for each interval: normal, with a mean that depends on the state
@@ -225,7 +225,7 @@ class InferenceNetwork(VariationalGuide):
     centred noise.
 
     Args:
-        data: training drives, as returned by `for_program`.
+        data: training trajectories, as returned by `for_program`.
         width: of the recurrent network.
         centred: propose the noise's values, not its deviations from the program's mean, see `VariationalGuide`.
         more: of `VariationalGuide`.
@@ -271,7 +271,7 @@ class InferenceNetwork(VariationalGuide):
         self.to(data.controls)
 
     def begin(self, data: Trajectories) -> Tensor:
-        """Read the drives backward; centred, log q(z) of all intervals' noise, `(M,)`, which no state changes."""
+        """Read the trajectories backward; centred, log q(z) of all intervals' noise, `(M,)`, which no state changes."""
         inputs = self._inputs(data)
         backward = (data.lengths - 1 - torch.arange(len(inputs), device=inputs.device)[:, None]) % len(inputs)
         turned = self.encoder(inputs).tanh().take_along_dim(backward[..., None], 0)
@@ -289,7 +289,7 @@ class InferenceNetwork(VariationalGuide):
         return torch.where(data.transitions, density.sum(-1), 0.0).sum((1, 2))
 
     def start(self) -> tuple[Tensor, Tensor]:
-        """Of a full covariance: where a drive begins, how it heads and how fast it is hang together."""
+        """Of a full covariance: where a trajectory begins, how it heads and how fast it is hang together."""
         size = self.sizes["first"]
         mean, log_sd, below = self.first(self.code).split([size, size, _below(size)], -1)
         random = torch.randn(self.draws, *mean.shape, dtype=mean.dtype, device=mean.device)

@@ -110,7 +110,7 @@ def _gradients(component: Tensor, leaves: list[Tensor]) -> Sequence[Tensor]:
         return torch.autograd.grad(component.sum(), leaves, retain_graph=True, materialize_grads=True)
     except (NotImplementedError, RuntimeError) as error:
         why = f"{str(error).splitlines()[0]} (--recipe steady --guide bootstrap takes any)"
-        raise ProgramError(f"the program cannot be linearised: {why}") from error
+        raise ProgramError(f"the model cannot be linearised: {why}") from error
 
 
 class Slopes(NamedTuple):

@@ -88,7 +88,7 @@ def neglected(
         data: as returned by `for_program`.
         known_start: the first state is certain.
         particles: of the filter, for each trajectory.
-        ahead: of these drives; found from the measurements when None.
+        ahead: of these trajectories; found from the measurements when None.
         kernels: see `particle_filter`.
     """
     ahead = ahead or find_and_smooth(Problem(program, data, known_start))

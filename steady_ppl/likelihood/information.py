@@ -33,7 +33,7 @@ from steady_ppl.model.program import Program
 from steady_ppl.utils.cores import one_thread
 from steady_ppl.utils.text import reason_of
 
-NOT_KNOWN = "how well the drives determine the parameters is not known: {}"
+NOT_KNOWN = "how well the trajectories determine the parameters is not known: {}"
 MAX_OBSERVATIONS = 6  # times that the curvature is observed, each with the sizes of the one before
 
 
@@ -117,7 +117,7 @@ def information_of_fit(
     except Exception as error:  # also of the program's own code, at numbers that nobody tried before; the fit stays
         return None, [NOT_KNOWN.format(reason_of(error))]
     if not (math.isfinite(gain) and bool(torch.isfinite(matrix).all())):
-        return None, [NOT_KNOWN.format("the program diverges beside them")]
+        return None, [NOT_KNOWN.format("the model diverges beside them")]
     names = tuple(part.name for part in parts)
     return ParameterInformation(names, (matrix + matrix.T) / 2, gain, frozenset(problem.data.digests)), []
 

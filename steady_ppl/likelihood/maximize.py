@@ -224,7 +224,9 @@ class _Curvature:
             self.forget(here)
             move, singular = torch.linalg.solve_ex(self.matrix, here.gradient)
         if singular:
-            raise FilterError("the likeliest parameters cannot be found: the drives do not tell them apart (singular)")
+            raise FilterError(
+                "the likeliest parameters cannot be found: the trajectories do not tell them apart (singular)"
+            )
         return move, 0.5 * float(here.gradient @ move)
 
     def forget(self, here: LinearizedObjective) -> None:
@@ -384,10 +386,10 @@ def fit_by_likelihood(
 
     Raises:
         UsageError: more learnable numbers than can be looked at one by one.
-        FilterError: the drives cannot be smoothed.
+        FilterError: the trajectories cannot be smoothed.
     """
     problem = Problem(program, data, known_start)
-    with stages(("finding paths", 1), ("scoring steps", 3), ("drives that strayed", 1)) as begin:
+    with stages(("finding paths", 1), ("scoring steps", 3), ("trajectories that strayed", 1)) as begin:
         begin()
         path = widen_noise(problem)
         begin()

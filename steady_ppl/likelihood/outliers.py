@@ -118,7 +118,7 @@ class Outliers:
         clearest = sorted(self.found, key=lambda one: -one.gain)
         more = len(clearest) - MAX_LINES
         count = f"{self.cells} reading{'s' * (self.cells > 1)}"
-        of_which = f" of the {drives} drives" if drives else ""
+        of_which = f" of the {drives} trajectories" if drives else ""
         lines = [f"{count}{of_which} left out as wrong ({how}):"]
         lines += [f"  {one}" for one in clearest[:MAX_LINES]]
         return lines + [f"  and {more} more"] * (more > 0)

@@ -94,20 +94,20 @@ def parameter_posterior(
     proposals: int = 400,
     seed: int = 0,
 ) -> ParameterPosterior:
-    """Draw the parameters given drives; `program` stays as it is, and need not be at its maximum.
+    """Draw the parameters given trajectories; `program` stays as it is, and need not be at its maximum.
 
     A parameter without a prior (`Program.priors`) has a flat one on its own value.
 
     Args:
         program: with normal noise and at most some dozens of learnable numbers, fitted or near it.
-        table: the drives.
+        table: the trajectories.
         known_start: the first row's true state is given.
         draws: M.
         proposals: K, of which each needs a run of the smoother.
         seed: of all draws.
 
     Raises:
-        FilterError: the drives cannot be smoothed at the program's parameters, or at none of the values.
+        FilterError: the trajectories cannot be smoothed at the program's parameters, or at none of the values.
         UsageError: more learnable numbers than can be looked at one by one.
     """
     require(draws >= 1, "draws", draws, "at least 1")
@@ -218,7 +218,7 @@ def log_posterior(program: Program, values: Tensor, judge: LogLikelihood) -> Ten
     set_values(parts, before)
     found = torch.where(torch.isfinite(found), found, -torch.inf)
     if not bool(torch.isfinite(found).any()):
-        raise FilterError("at none of the parameters' values can these drives be smoothed")
+        raise FilterError("at none of the parameters' values can these trajectories be smoothed")
     return found
 
 
@@ -299,14 +299,14 @@ def _sentence(parts: Sequence[Element], direction: Tensor) -> str:
     chosen = [index for index in range(len(parts)) if abs(float(share[index])) > MIN_SHARE]
     names = [parts[index].name for index in chosen]
     if len(chosen) == 1:
-        return f"these drives do not tell {names[0]}: many values are as likely"
+        return f"these trajectories do not tell {names[0]}: many values are as likely"
     listed = f"{', '.join(names[:-1])} and {names[-1]}"
     pair = [float(share[index]) for index in chosen]
     equal = len(pair) == 2 and abs(abs(pair[0]) - abs(pair[1])) < SAME_SHARE
     if equal and not any(parts[index].has_unit for index in chosen):
         what = "product" if pair[0] * pair[1] < 0 else "ratio"
-        return f"these drives tell only the {what} of {listed}, not each"
-    return f"these drives tell {listed} only together, not each"
+        return f"these trajectories tell only the {what} of {listed}, not each"
+    return f"these trajectories tell {listed} only together, not each"
 
 
 def in_own_sizes(inverse: Callable[[Tensor], Tensor], information: Tensor) -> Tensor:

@@ -54,9 +54,9 @@ def elements(program: Program, *, frozen: bool = False) -> list[Element]:
             found.append(Element(parameter, index, step, owner, has_unit, owner in steps))
     if len(found) > MAX_LEARNABLE_NUMBERS:
         raise UsageError(
-            f"program {type(program).__name__} has {len(found)} learnable numbers: a network cannot be looked at "
+            f"model {type(program).__name__} has {len(found)} learnable numbers: a network cannot be looked at "
             "parameter by parameter. Fit it with the recipe steady; discover the effects that are missing from a "
-            "mechanistic program, or from a hybrid of one"
+            "mechanistic model, or from a hybrid of one"
         )
     return found
 

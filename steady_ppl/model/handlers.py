@@ -53,7 +53,7 @@ class Observing(ByColumn):
     def __exit__(self, *exception: Any) -> None:
         super().__exit__(*exception)
         if exception[0] is None and self.column != self.measurements.shape[-1]:
-            declares = f"the program declares {self.measurements.shape[-1]}"
+            declares = f"the model declares {self.measurements.shape[-1]}"
             raise ProgramError(f"observe sampled {self.column} measurement components, {declares}", site="observe")
 
     def _pyro_sample(self, message: Any) -> None:

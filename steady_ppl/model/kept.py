@@ -91,14 +91,14 @@ def kept_columns(kind: Any) -> dict[str, Sequence[str]]:
     """Name of each quantity that a vehicle's class keeps, for its own lines and for its sensors → its states."""
     if isinstance(kind.keeps, str) or not isinstance(kind.keeps, Sequence):
         what = f"keeps is {kind.keeps!r}; one quantity is ('acceleration',)"
-        raise ProgramError(f"program {kind.__name__}: {what}", site="keeps")
+        raise ProgramError(f"model {kind.__name__}: {what}", site="keeps")
     listed = kind.sensors if isinstance(kind.sensors, Sequence) else ()
     asked = (getattr(one, "keeps", ()) for one in listed if not isinstance(one, type))
     wanted = dict.fromkeys([*kind.keeps, *(name for names in asked for name in names)])
     for name in wanted:
         if name not in QUANTITIES:
             what = f"keeps names {name!r}; a vehicle can keep {', '.join(QUANTITIES)}"
-            raise ProgramError(f"program {kind.__name__}: {what}", site="keeps")
+            raise ProgramError(f"model {kind.__name__}: {what}", site="keeps")
     return {name: QUANTITIES[name].columns(kind) for name in wanted}
 
 

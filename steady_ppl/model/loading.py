@@ -35,7 +35,7 @@ def load_program(source: str | Path) -> Program:
         have = ", ".join(programs) or "none"
         if inspect.isclass(program_class):
             have += f"; its class {class_name} derives from no steady_ppl.Program"
-        raise ProgramError(f"{file.name} has no program {class_name}; its programs: {have} (choose with {path}:NAME)")
+        raise ProgramError(f"{file.name} has no model {class_name}; its models: {have} (choose with {path}:NAME)")
     try:
         return program_class()
     except SteadyError:

@@ -124,15 +124,15 @@ class PlanarVehicle(Program):
         wrong = [one for one in sensors if isinstance(one, type) or not hasattr(one, "parts")]
         if wrong or not isinstance(self.sensors, Sequence):
             about = f"`sensors` is a list of sensors, as `(Ranges(sd=0.1),)`, got {(wrong or [self.sensors])[0]!r}"
-            raise ProgramError(f"program {type(self).__name__}: {about}", site="sensors")
+            raise ProgramError(f"model {type(self).__name__}: {about}", site="sensors")
         if lost := [one for one in sensors if not kept_columns(type(self)).keys() >= {*one.keeps}]:
             keeps = f"its sensor {lost[0].name} keeps {', '.join(lost[0].keeps)}"
             about = f"{keeps}: list `sensors` in the body of the class"
-            raise ProgramError(f"program {type(self).__name__}: {about}", site="sensors")
+            raise ProgramError(f"model {type(self).__name__}: {about}", site="sensors")
         return sensors
 
     def kept(self, state: Tensor, quantity: str) -> Tensor:
-        """Something that the vehicle keeps of the row that ends with a state, `(..., n)`; zero in a drive's first row.
+        """Something that the vehicle keeps of the row that ends with a state, `(..., n)`; zero in the first row.
 
         Args:
             state: `(..., D)`, as `observe` has it.
@@ -150,7 +150,7 @@ class PlanarVehicle(Program):
                 return state[..., begins : begins + len(columns)]
             begins += len(columns)
         about = f"it does not keep {quantity!r}: name it in `keeps`"
-        raise ProgramError(f"program {type(self).__name__}: {about}", site="keeps")
+        raise ProgramError(f"model {type(self).__name__}: {about}", site="keeps")
 
     def _places(self, columns: Mapping[str, Sequence[str]]) -> dict[str, tuple[int, ...]]:
         """The indices of measurements by their names, of those that stand side by side."""
@@ -353,11 +353,11 @@ class UnknownMap(PlanarVehicle):
 
     It is put before a vehicle that declares them: `class Mine(UnknownMap, Hovercraft)`. Bearings alone leave the frame
     open: a map is learned only with known starts, with two `surveyed` landmarks, with a listed sensor of the position,
-    or relative to where drives begin (`framed_by_start`), which is worth as much as `initial` is narrow.
+    or relative to where trajectories begin (`framed_by_start`), which is worth as much as `initial` is narrow.
 
     Attributes:
         surveyed: which landmarks are where they are declared, by index.
-        framed_by_start: where and how drives begin is known well enough by `initial` alone.
+        framed_by_start: where and how trajectories begin is known well enough by `initial` alone.
         map: `(K, 2)` m, learnable.
     """
 
@@ -372,11 +372,11 @@ class UnknownMap(PlanarVehicle):
         if not len(declared):
             example = "class Mine(UnknownMap, Hovercraft)"
             about = f"UnknownMap stands before the vehicle that declares landmarks, as in {example}"
-            raise ProgramError(f"program {type(self).__name__}: {about}", site="__init__")
+            raise ProgramError(f"model {type(self).__name__}: {about}", site="__init__")
         for index in self.surveyed:
             if not 0 <= index < len(declared):
                 about = f"surveyed names landmark {index}, there are 0 to {len(declared) - 1}"
-                raise ProgramError(f"program {type(self).__name__}: {about}", site="surveyed")
+                raise ProgramError(f"model {type(self).__name__}: {about}", site="surveyed")
         stays = torch.zeros(len(declared), 1, dtype=torch.bool)
         stays[list(self.surveyed)] = True
         self.register_buffer("declared", torch.as_tensor(declared, dtype=torch.get_default_dtype()), persistent=False)
@@ -398,7 +398,7 @@ class UnknownMap(PlanarVehicle):
         sees_position = any(part.kind == "position" for part in self.sensor_parts)
         if not (known_start or self.surveyed_frame or self.framed_by_start or sees_position):
             raise UsageError(
-                f"program {type(self).__name__}: nothing fixes the frame of its map: give known starts "
+                f"model {type(self).__name__}: nothing fixes the frame of its map: give known starts "
                 "(--known-start), name two landmarks that are `surveyed`, list a sensor of the position, or set "
                 "`framed_by_start = True` where `initial` is narrow"
             )

@@ -120,9 +120,9 @@ class Program(PyroModule):
         angles: the state components that live on a circle.
         motion: channel → the state components that are its position and its velocity; the generic effects go by it.
         error_groups: what an error is reported for: name → components whose Euclidean norm it is.
-        resting: state components that start at zero in every drive; a table need not have them.
+        resting: state components that start at zero in every trajectory; a table need not have them.
         kept_names: those of them that are begun anew in every row.
-        since_row_before: measurements that the first row of a drive cannot have; cells of the table are passed over.
+        since_row_before: measurements that a first row cannot have; cells of the table are passed over.
         start: "first measurements" centres the prior of `initial` on each trajectory's first measurements, see
             `steady_ppl.model.starts`; "" leaves it as it is.
         roles: control → what it is, `{"delta": "steering"}`; one called as a role of `model.roles` has it by its name.
@@ -179,21 +179,21 @@ class Program(PyroModule):
         hidden = isinstance(value, PyroParam | PyroSample | torch.nn.Parameter) and hasattr(type(self), name)
         if hidden and not callable(getattr(type(self), name)):
             about = f"{name} is a constant of its class, which would hide the parameter: take another name"
-            raise ProgramError(f"program {type(self).__name__}: {about}", site="__init__")
+            raise ProgramError(f"model {type(self).__name__}: {about}", site="__init__")
         super().__setattr__(name, value)
 
     def initial(self) -> Tensor:
         """Sample the start; returns the first state, `(..., D)`."""
-        raise ProgramError(f"program {type(self).__name__} lacks the method initial(self)", site="initial")
+        raise ProgramError(f"model {type(self).__name__} lacks the method initial(self)", site="initial")
 
     def transition(self, state: Tensor, control: Tensor, time: Tensor, step: Tensor) -> Tensor:
         """Sample the channel noise and move on by `step`; returns the next state, `(..., D)`."""
         method = "transition(self, state, control, time, step)"
-        raise ProgramError(f"program {type(self).__name__} lacks the method {method}", site="transition")
+        raise ProgramError(f"model {type(self).__name__} lacks the method {method}", site="transition")
 
     def observe(self, state: Tensor) -> None:
         """Sample the measurement of `state`, without `obs=`: the engine conditions and masks."""
-        raise ProgramError(f"program {type(self).__name__} lacks the method observe(self, state)", site="observe")
+        raise ProgramError(f"model {type(self).__name__} lacks the method observe(self, state)", site="observe")
 
     def actuators(self, control: Tensor, time: Tensor) -> Tensor:
         """Return the controls as they act, `(rows, trajectories, U)`: what lag, delay and wear make of commands.
@@ -291,7 +291,7 @@ class Program(PyroModule):
         return context.with_effect(self, effect, value, **where)
 
     def example_controls(self, time: Tensor) -> Tensor:
-        """Controls of simulated drives, `(rows, trajectories, U)` at times `(rows, trajectories)`; zero by default."""
+        """Controls to simulate with, `(rows, trajectories, U)` at times `(rows, trajectories)`; zero by default."""
         return time.new_zeros((*time.shape, len(self.controls)))
 
     def prepare(self, data: Trajectories, known_start: bool) -> None:

@@ -40,7 +40,7 @@ def controls_of(program: Program, *roles: str) -> tuple[str, ...]:
         ProgramError: `roles` is wrong; see `wrong_roles`.
     """
     for problem in wrong_roles(program):
-        raise ProgramError(f"program {type(program).__name__}{problem}", site="roles")
+        raise ProgramError(f"model {type(program).__name__}{problem}", site="roles")
     unit_of = dict(zip(program.control_names, program.control_units, strict=True))
     found = {name: name for name in unit_of if name not in program.roles and _fits(name, unit_of[name])}
     found |= {role: name for name, role in program.roles.items()}

@@ -164,7 +164,7 @@ def require_convergence(program: Program, state: Tensor, control: Tensor, time: 
     if counts_rows(program):
         what = "actuators counts rows and not seconds, which is another delay in substeps"
         how = "shift commands by `time`, for example with steady_ppl.delayed"
-        raise ProgramError(f"program {type(program).__name__}: {what}; {how}", site="actuators")
+        raise ProgramError(f"model {type(program).__name__}: {what}; {how}", site="actuators")
 
     def ends(count: int) -> Tensor:
         return _after(with_substeps(program, count), state, (control, time, step), 1.0)
@@ -176,7 +176,7 @@ def require_convergence(program: Program, state: Tensor, control: Tensor, time: 
         component = program.state_names[int(beyond.argmax())]
         what = f"transition is no step in `step`: at K and 2 K substeps {component} goes apart as K grows"
         how = "move the state in proportion to `step`, with noise that does not depend on it"
-        raise ProgramError(f"program {type(program).__name__}: {what}; {how}", site="transition")
+        raise ProgramError(f"model {type(program).__name__}: {what}; {how}", site="transition")
 
 
 def _probe_points(program: Program, data: Trajectories) -> tuple[Tensor, _Given]:

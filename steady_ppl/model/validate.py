@@ -31,7 +31,7 @@ def probe(program: Program) -> None:
     """
     name = type(program).__name__
     for problem in _misdeclared(program):
-        raise ProgramError(f"program {name}{problem}")
+        raise ProgramError(f"model {name}{problem}")
     size, width = len(program.states), len(program.measurements)
     parameter = next(program.parameters(), torch.zeros(()))
     with torch.random.fork_rng():
@@ -59,7 +59,7 @@ def probe(program: Program) -> None:
         density = seen.total()
         if density.shape != LEFT:
             what = f"the density of observe has shape {tuple(density.shape)}; expected {LEFT} {EVENT_HINT}"
-            raise ProgramError(f"program {name}: {what}", site="observe")
+            raise ProgramError(f"model {name}: {what}", site="observe")
         _check_sites(name, started, noise, seen)
 
         # one element alone must come out as it did among the others
@@ -75,7 +75,7 @@ def probe(program: Program) -> None:
             if not torch.allclose(among[draw, row, drive], by_itself, rtol=1e-3, atol=1e-4, equal_nan=True):
                 what = "mixes draws, rows or trajectories: one alone gives another result than among others"
                 how = "work on the last dimension only (no sum or mean over the others)"
-                raise ProgramError(f"program {name}: {method} {what}; {how}", site=method)
+                raise ProgramError(f"model {name}: {method} {what}; {how}", site=method)
 
 
 def _misdeclared(program: Program) -> Iterator[str]:
@@ -112,13 +112,13 @@ def _misdeclared(program: Program) -> Iterator[str]:
 def _check_noise(name: str, noise: Recording) -> None:
     if not noise.values:
         about = "transition samples nothing: at least one channel must be noisy"
-        raise ProgramError(f"program {name}: {about}", site="transition")
+        raise ProgramError(f"model {name}: {about}", site="transition")
     for site, value in noise.values.items():
         fn = noise.distributions[site]
         if fn.event_dim > 1 or tuple(value.shape[: value.dim() - fn.event_dim]) != LEFT:
             has = f"shape {tuple(value.shape)} with event shape {tuple(fn.event_shape)}"
             what = f"has {has}; expected {LEFT} and at most one event dimension {EVENT_HINT}"
-            raise ProgramError(f"program {name}: site {site!r} of transition {what}", site=site)
+            raise ProgramError(f"model {name}: site {site!r} of transition {what}", site=site)
 
 
 def _check_sites(name: str, *recordings: Recording) -> None:
@@ -128,7 +128,7 @@ def _check_sites(name: str, *recordings: Recording) -> None:
         for site in recording.distributions:
             if site in taken:
                 about = f"site {site!r} of {method} has a name that {taken[site]} uses too"
-                raise ProgramError(f"program {name}: {about}", site=site)
+                raise ProgramError(f"model {name}: {about}", site=site)
             taken[site] = method
 
 
@@ -158,12 +158,12 @@ def _call(
             return run(), recording  # type: ignore[return-value]
         except SteadyError as error:
             if isinstance(error, ProgramError) and name not in str(error):
-                raise ProgramError(f"program {name}: {method}: {error}", site=error.site) from error
+                raise ProgramError(f"model {name}: {method}: {error}", site=error.site) from error
             raise
         except Exception as error:
             on = "" if method == "initial" else f" on states of shape {LEFT} + (D,)"
             hint = f" {EVENT_HINT}" if "broadcast" in str(error) else ""
-            raise ProgramError(f"program {name}: {method} failed{on}: {one_line(error)}{hint}", site=method) from error
+            raise ProgramError(f"model {name}: {method} failed{on}: {one_line(error)}{hint}", site=method) from error
 
 
 def _density(recording: Recording, site: str) -> Tensor:

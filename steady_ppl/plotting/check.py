@@ -34,7 +34,7 @@ def check_picture(found: Check) -> Figure:
         panels = left.subplots(shown, 1, sharex=True, squeeze=False)[:, 0]
         for component, axes in enumerate(panels):
             predictions(found, drive, component, axes)
-        panels[0].set_title(f"measured and predicted, drive {found.data.labels[drive]}", parse_math=False)
+        panels[0].set_title(f"measured and predicted, trajectory {found.data.labels[drive]}", parse_math=False)
         panels[-1].set_xlabel("time [s]")
         left.legend(*panels[0].get_legend_handles_labels(), fontsize=8, ncols=4, loc="outside lower center")
         figure.suptitle("\n".join(textwrap.wrap(verdict(found), CHECK_TITLE_COLUMNS)), fontsize=10)
@@ -86,7 +86,7 @@ def _with_breaks(time: np.ndarray, middle: np.ndarray, half: np.ndarray) -> tupl
 def where_and_when(found: Check, axes: Axes) -> None:
     """The strongest residual of every drive and strip of time."""
     times, every = strips(found)
-    axes.set_title("where and when: strongest mean residual of each drive and strip")
+    axes.set_title("where and when: strongest mean residual of each trajectory and strip")
     if not times:
         axes.text(0.5, 0.5, "too few rows for strips", ha="center", va="center", transform=axes.transAxes)
         axes.set_axis_off()
@@ -99,7 +99,7 @@ def where_and_when(found: Check, axes: Axes) -> None:
             axes.plot(sum(finding.cell.where["time"]) / 2, finding.cell.where["drive"] + 1, "k*", ms=5)
     step = max(1, len(grid) // 8)
     axes.set_yticks(np.arange(1, len(grid) + 1, step), found.data.labels[::step], fontsize=7, parse_math=False)
-    axes.set(xlabel="time [s]  (★ significant)", ylabel="drive")
+    axes.set(xlabel="time [s]  (★ significant)", ylabel="trajectory")
     axes.figure.colorbar(mesh, ax=axes).set_label("simulated sd")
 
 
@@ -134,7 +134,7 @@ def against_references(found: Check, axes: Axes) -> None:
         relative = [over_floor(*errors[horizon], found.floor[horizon]) for horizon in horizons]
         axes.plot(seconds, relative, style, color=color, label=label, ms=4)
 
-    line({ahead: (one.error, one.observed) for ahead, one in found.predictions.items()}, "o-", NEAR_COLOR, "program")
+    line({ahead: (one.error, one.observed) for ahead, one in found.predictions.items()}, "o-", NEAR_COLOR, "model")
     line(found.held, "s:", "0.5", "last measurement")
     if isinstance(found.reference, Reference):
         theirs = {ahead: (one.error, one.observed) for ahead, one in found.reference.predictions.items()}

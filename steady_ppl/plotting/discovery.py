@@ -58,7 +58,7 @@ def discovery_picture(found: Discovery) -> Figure:
             above, below = left.subplots(2, 1, height_ratios=(height - 3.5, 3))
             gains(rows, above)
             open_loop_picture(found.proof, axes=below)
-            titled(below, "prediction error on the validation drives", below.get_xlabel())
+            titled(below, "prediction error on the validation trajectories", below.get_xlabel())
         if found.shape:
             unknown_effect(found, axes=right.subplots())
         else:
@@ -90,7 +90,7 @@ def gains(rows: Sequence[GainRow], axes: Axes) -> None:
     for color in [color for color in kinds if any(row.label and row.color == color for row in rows)]:
         axes.plot([], [], "o", color=color, ms=5, label=kinds[color])
     if any(row.label and row.interval is None and row.value >= left for row in rows):
-        axes.plot([], [], "o", mfc="none", color=OTHER_COLOR, ms=5, label="stopped after half of the drives")
+        axes.plot([], [], "o", mfc="none", color=OTHER_COLOR, ms=5, label="stopped after half of the trajectories")
     axes.legend(fontsize=7, loc="upper center", bbox_to_anchor=(0.5, -0.12), ncols=3)
 
 
@@ -213,7 +213,7 @@ def _point(axes: Axes, row: GainRow, place: float, hollow: bool = False) -> None
 
 
 def unknown_effect(found: Discovery, *, axes: Axes | None = None) -> Axes:
-    """The curve that explains the drives where no effect of the catalogue does, with its band; grey where no drive was.
+    """The curve that explains the trajectories where no effect does, with its band; grey where no trajectory was.
 
     Raises:
         UsageError: the verdict is another one: there is no curve.
@@ -244,7 +244,7 @@ def unknown_effect(found: Discovery, *, axes: Axes | None = None) -> Axes:
     axes.set_ylabel(f"missing from {shape.channel}{times}{f' [{shape.unit}]' if shape.unit not in ('', '1') else ''}")
     axes.legend(fontsize=7, loc="upper right" if heights[0] > heights[-1] else "upper left")
     variable = with_unit(shape.variable, shape.variable_unit)
-    return titled(axes, "the curve that is missing, in no catalogue", f"{variable}; ticks: where the drives were")
+    return titled(axes, "the curve that is missing, in no catalogue", f"{variable}; ticks: where the trajectories were")
 
 
 def titled(axes: Axes, title: str, about: str, lines: Sequence[str] | None = None) -> Axes:

@@ -153,13 +153,13 @@ def forecast_band(
 
 
 def held_out_curve(fit: Fit, *, axes: Axes | None = None, label: str = "held-out log p(y)") -> Axes:
-    """Held-out log p(y), the mean of a drive, over the steps; the step whose parameters were kept is marked.
+    """Held-out log p(y), the mean of a trajectory, over the steps; the step whose parameters were kept is marked.
 
     Raises:
-        UsageError: the fit was not trained, or without held-out drives.
+        UsageError: the fit was not trained, or without held-out trajectories.
     """
-    steps, values = _logged(fit, "log_likelihood", "it was fitted without held-out drives")
-    axes = _over_steps(axes, "held-out log p(y) [nats a drive]")
+    steps, values = _logged(fit, "log_likelihood", "it was fitted without held-out trajectories")
+    axes = _over_steps(axes, "held-out log p(y) [nats a trajectory]")
     (line,) = axes.plot(steps, values, "o-", ms=3, label=label)
     assert fit.trained is not None
     if fit.trained.rise:
@@ -178,7 +178,7 @@ def observation_noise(fit: Fit, *, axes: Axes | None = None, label: str = "as th
     figure = "kl_weight" if annealed else "observation_weight"
     steps, weights = _logged(fit, figure, "its observations were not tempered")
     factors = [math.sqrt(weight) if annealed else 1 / math.sqrt(weight) for weight in weights]
-    axes = _over_steps(axes, "observation noise / the program's")
+    axes = _over_steps(axes, "observation noise / the model's")
     axes.plot(steps, factors, "o-", ms=3, label=label)
     axes.axhline(1, color="black", lw=0.6)
     axes.set_yscale("log")

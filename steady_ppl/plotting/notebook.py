@@ -57,7 +57,7 @@ def _(fit: Fit) -> str:
     if trained and trained.rise:
         first, kept = trained.rise
         said += PARAGRAPH.format(
-            f"held-out log p(y) {first:.2f} → {kept:.2f} nats a drive, kept at step {trained.kept}"
+            f"held-out log p(y) {first:.2f} → {kept:.2f} nats a trajectory, kept at step {trained.kept}"
         )
     said += _table(("parameter", "value"), parameter_rows(fit.program))
     for note in fit.notes:

@@ -5,7 +5,7 @@ function address({ run, drive, from, to }) {
 }
 
 function go(drive, from, to) {
-  if (drive < 0) return void (element("place").textContent = "This drive is not among those that are shown row by row.");
+  if (drive < 0) return void (element("place").textContent = "This trajectory is not among those that are shown row by row.");
   follow(address({ run: view.run, drive, from: Math.max(0, from), to }));
 }
 

@@ -1,6 +1,6 @@
 // Curves over the time or over the time ahead, and the coefficients of the candidates.
 const TICKS = [0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 50, 100];
-const where = () => `${page.runs[view.run].label}, drive ${page.labels[view.drive]}, ${secondsShown()}`;
+const where = () => `${page.runs[view.run].label}, trajectory ${page.labels[view.drive]}, ${secondsShown()}`;
 const secondsShown = () => (view.from === null ? "all seconds" : `${view.from.toFixed(1)} to ${view.to.toFixed(1)} s`);
 
 // Components below one another over the same seconds; each axis fits what is in them.

@@ -122,7 +122,7 @@ class Shown:
         """What is left out, in words."""
         said = []
         if len(self.drives) < self.total:
-            said.append(f"{len(self.drives)} of {self.total} drives, those with the strongest misfits")
+            said.append(f"{len(self.drives)} of {self.total} trajectories, those with the strongest misfits")
         if self.every > 1:
             said.append(f"every {self.every}th row")
         return f"The curves show {' and '.join(said)}; the maps and figures are of all." if said else None

@@ -49,14 +49,14 @@ function drawMap() {
         line: { width: chosen ? 1 : 0, color: "black" }, showscale: Boolean(strips) && drive === 0, colorbar: { title: { text: "sd" }, thickness: 12 },
       },
       customdata: time.map((seconds) => [drive, seconds]), text: time.map(() => plain(label)), showlegend: false,
-      hovertemplate: "drive %{text}, %{customdata[1]:.1f} s: %{marker.color:.1f} sd<extra></extra>",
+      hovertemplate: "trajectory %{text}, %{customdata[1]:.1f} s: %{marker.color:.1f} sd<extra></extra>",
     };
   });
   const same = across !== null && horizontal.unit === run.states[up].unit;
   return plot("map", traces, {
     xaxis: { title: { text: withUnit(horizontal) }, zeroline: false },
     yaxis: { title: { text: withUnit(run.states[up]) }, zeroline: false, ...(same ? { scaleanchor: "x" } : {}) },
-  }, `The drives of ${run.label}, coloured by misfit; the list of strips has the same places as links`).then((drawn) => listen(drawn, (point) => {
+  }, `The trajectories of ${run.label}, coloured by misfit; the list of strips has the same places as links`).then((drawn) => listen(drawn, (point) => {
     const [drive, seconds] = point.customdata;
     go(drive, seconds - 1, seconds + 1);
   }));
@@ -64,22 +64,22 @@ function drawMap() {
 
 function drawStrips() {
   const run = page.runs[view.run], strips = run.strips;
-  if (!strips) return empty("strips", "The drives are too short for strips of time.");
+  if (!strips) return empty("strips", "The trajectories are too short for strips of time.");
   const z = strip(view.run, view.residual), stars = standsOut(strips), number = strips.drives.map((_, i) => i);
   const middle = strips.edges.slice(1).map((edge, i) => (edge + strips.edges[i]) / 2);
   const names = strips.drives.map((label) => plain(label.length > 16 ? `${label.slice(0, 15)}…` : label));
-  const yaxis = { title: { text: "drive" }, autorange: "reversed", automargin: true, tickvals: number, ticktext: names };
+  const yaxis = { title: { text: "trajectory" }, autorange: "reversed", automargin: true, tickvals: number, ticktext: names };
   element("strips").style.height = `${Math.max(320, 90 + 16 * strips.drives.length)}px`;
   return plot("strips", [
-    heatmap(strips.edges, number, z, strips.drives.map((label) => middle.map(() => plain(label))), "drive %{text}, %{x:.1f} s"),
+    heatmap(strips.edges, number, z, strips.drives.map((label) => middle.map(() => plain(label))), "trajectory %{text}, %{x:.1f} s"),
     marks(stars.map(([, , at]) => middle[at]), stars.map(([, drive]) => drive), stars.map(([residual, drive, at]) => series(strips.z, residual, drive)[at])),
-  ], { xaxis: { title: { text: "time [s]" }, zeroline: false }, yaxis }, `Misfit of ${run.label} of every drive and strip of time; the list below has the same places as links`)
+  ], { xaxis: { title: { text: "time [s]" }, zeroline: false }, yaxis }, `Misfit of ${run.label} of every trajectory and strip of time; the list below has the same places as links`)
     .then((drawn) => listen(drawn, (point) => point.pointIndex && go(...ofStrip(strips, ...point.pointIndex))));
 }
 
 function drawRegimes() {
   const run = page.runs[view.run], columns = run.regimes.columns, position = columns.map((_, i) => i);
-  if (!columns.length) return empty("regimes", "The drives have too few rows for ranges.");
+  if (!columns.length) return empty("regimes", "The trajectories have too few rows for ranges.");
   const cells = run.residuals.map((_, residual) => columns.map((_, column) => run.regimes.cells.find(([r, c]) => r === residual && c === column)));
   const stars = run.regimes.cells.filter(([, , , significant]) => significant);
   const first = (i) => i === 0 || columns[i].variable !== columns[i - 1].variable, starts = position.filter(first);
@@ -128,10 +128,10 @@ function linked(z, stands, place) {
 
 function listStrips() {
   const strips = page.runs[view.run].strips;
-  if (!strips) return "The drives are too short for strips of time.";
+  if (!strips) return "The trajectories are too short for strips of time.";
   const z = strip(view.run, view.residual), out = new Set(standsOut(strips).map(([, drive, at]) => `${drive} ${at}`));
   const head = strips.edges.slice(1).map((edge, i) => `${strips.edges[i].toFixed(1)} to ${edge.toFixed(1)} s`);
-  return tableOf(["drive", ...head], strips.drives.map((label, d) =>
+  return tableOf(["trajectory", ...head], strips.drives.map((label, d) =>
     [label, ...z[d].map((one, at) => linked(one, out.has(`${d} ${at}`), ofStrip(strips, d, at)))]));
 }
 

@@ -44,7 +44,7 @@ class Report:
         fits, checks: by the runs' labels.
         proof: of the runs against the first one, or why there is none.
         discovery: the figures of `discover`, if there are any.
-        shown: the drives that the page has row by row.
+        shown: the trajectories that the page has row by row.
         drives: what is shown of them, and of each run's predictions and states.
         how: lines that say how to repeat it.
         notes: what a reader must know before believing it.
@@ -214,19 +214,19 @@ def report(
     horizons: Sequence[float] = (),
     seed: int = 0,
 ) -> Report:
-    """Say on one page what fitted programs explain of some drives, where they fail and what they lack.
+    """Say on one page what fitted programs explain of some trajectories, where they fail and what they lack.
 
     Args:
         runs: label → fit, the one before first.
-        data: drives, best those that no run has used. Their true states, where the table has them, are drawn and used
-            for nothing else.
+        data: trajectories, best those that no run has used. Their true states, where the table has them, are drawn and
+            used for nothing else.
         discovery: `discover(…).figures`; the page says how to come by them when not given.
         title: of the page.
         how: commands that lead here.
         notes: shown above everything else.
-        simulations: sets of drives simulated for the bands of each run's `check`.
+        simulations: sets of trajectories simulated for the bands of each run's `check`.
         draws: of the posterior of each run's states.
-        horizons: seconds ahead; those that suit the drives where none is given, see `data.horizons`.
+        horizons: seconds ahead; those that suit the trajectories where none is given, see `data.horizons`.
         seed: of simulations, draws and resampling.
 
     Raises:

@@ -16,10 +16,10 @@ from steady_ppl.runs.fit import Fit
 LOG_RATIO_TO_ZERO = math.log(20.0)  # log ratio by which a positive number falls to next to nothing
 LOG_RATIO_OF_GUESS = math.log(1e3)  # the same of a guess, such as noise
 HIDDEN = (
-    "these drives hardly depend on it as the program stands; a missing effect may hide it (`steady "
+    "these trajectories hardly depend on it as the model stands; a missing effect may hide it (`steady "
     "discover`), or commands are swapped, or a heading counts the other way"
 )
-COLLAPSED = "another part of the program takes its place; reset it in the program's file and fit again before any test"
+COLLAPSED = "another part of the model takes its place; reset it in the model's file and fit again before any test"
 
 
 def diagnose_fit(fit: Fit, declared: Mapping[str, Tensor]) -> list[str]:
@@ -30,8 +30,8 @@ def diagnose_fit(fit: Fit, declared: Mapping[str, Tensor]) -> list[str]:
         steps = fit.settings.get("steps")
         more = f"more steps (--steps {4 * steps})" if isinstance(steps, int) else "more steps"
         found.append(
-            f"not converged: held-out log p(y) rose by {trained.still_rising:.1f} nats a drive over the last quarter. "
-            f"Fit again with {more}, or a mechanistic program by --recipe likelihood, which takes seconds"
+            f"not converged: held-out log p(y) rose by {trained.still_rising:.1f} nats a trajectory over the last "
+            f"quarter. Fit again with {more}, or a mechanistic model by --recipe likelihood, which takes seconds"
         )
     for name, before in declared.items():
         short = parameter_name(name)
@@ -96,7 +96,7 @@ def _degrees(column: str, unit: str, seen: Tensor) -> list[str]:
         return []
     between = f"{float(seen.min()):.4g} and {float(seen.max()):.4g}"
     read = "radians" if unit == "rad" else "radians a second"
-    return [f"{column} is between {between} and the program reads {read}: are these degrees?"]
+    return [f"{column} is between {between} and the model reads {read}: are these degrees?"]
 
 
 def _is_positive(program: Program, name: str) -> bool:

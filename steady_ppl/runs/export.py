@@ -70,7 +70,7 @@ class Dynamics(nn.Module):
             controls: `(H, ..., U)`, each for one step; without the middle dimensions the same for all states.
             past: `(P, ..., U)` the commands before these, latest last, for programs that remember them; without the
                 middle dimensions the same for all plans.
-            time: s since the start of the drive at the first control; `P` steps when not given.
+            time: s since the start of the trajectory at the first control; `P` steps when not given.
             noisy: draw the channel noise instead of taking its mean.
 
         Returns:
@@ -83,7 +83,7 @@ class Dynamics(nn.Module):
         _require(state, "(..., {})", self.state_names)
         _require(controls, "(rows, ..., {})", self.control_names)
         if past is None and self.remembers:
-            how = "give those before as `past`, an empty tensor (0, ..., U) at the start of a drive"
+            how = "give those before as `past`, an empty tensor (0, ..., U) at the start of a trajectory"
             raise UsageError(f"in {type(self.program).__name__} commands act on after their step: {how}")
         past = controls[:0] if past is None else past
         _require(past, "(rows, ..., {})", self.control_names)

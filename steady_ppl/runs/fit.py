@@ -53,7 +53,7 @@ class Fit(Displayed):
         known_start: whether the true first state was given.
         trained: the history; None for a recipe that does not train.
         notes: anything that was rescued, replaced or left out on the way.
-        information: how well the drives determine the parameters; None where the recipe does not say.
+        information: how well the trajectories determine the parameters; None where the recipe does not say.
     """
 
     program: Program
@@ -99,8 +99,8 @@ class Fit(Displayed):
         return Dynamics(copy.deepcopy(self.program), self.program.step if step is None else step)
 
     def save(self, folder: str | Path, *, train: Trajectories | None = None, force: bool = False) -> None:
-        """Write parameters, record and, with the training drives, posterior draws to a run folder; RunError where it
-        exists (and is not `force`d) or cannot be written."""
+        """Write parameters, record and, with the training trajectories, posterior draws to a run folder; RunError where
+        it exists (and is not `force`d) or cannot be written."""
         with run_folder(folder, force=force) as opened:
             self.save_into(opened, train)
 
@@ -165,7 +165,7 @@ class Fit(Displayed):
         found = {(name, value.shape) for name, value in tensors.items()}
         if differing := sorted({name for name, _ in expected ^ found}):
             name = type(program).__name__
-            raise RunError(f"{folder}: the parameters do not fit program {name}: {', '.join(differing)}")
+            raise RunError(f"{folder}: the parameters do not fit model {name}: {', '.join(differing)}")
         learned = {name for name, _ in program.named_parameters()}
         broken = sorted(name for name, value in tensors.items() if name in learned and not value.isfinite().all())
         if broken:
@@ -212,22 +212,22 @@ def _load_recorded(folder: Path, source: dict[str, str] | None, moved: str | Pat
     if moved is not None:
         return load_program(moved)
     if source is None:
-        raise RunError(f"{folder}: its program came from no file: name it with --program PATH (or pass `program=`)")
+        raise RunError(f"{folder}: its model came from no file: name it with --program PATH (or pass `program=`)")
     try:
         name, recorded, class_name = source["file"], source["sha256"], source["class"]
         file = (folder / name).resolve()
         if not class_name.isidentifier():
             raise ValueError(class_name)
     except (ValueError, OSError) as error:
-        raise RunError(f"{folder / RUN_RECORD} is damaged: it does not say which program it is of") from error
+        raise RunError(f"{folder / RUN_RECORD} is damaged: it does not say which model it is of") from error
     if not file.is_file():
-        raise RunError(f"{folder}: its program {name} is gone: name it with --program PATH")
+        raise RunError(f"{folder}: its model {name} is gone: name it with --program PATH")
     if any((place / RUN_RECORD).exists() for place in file.parents):
         why = "came with a run, and nothing that comes with one is executed"
-        raise RunError(f"{folder}: its program {name} {why}: read it, and name it with --program PATH")
+        raise RunError(f"{folder}: its model {name} {why}: read it, and name it with --program PATH")
     if sha256(file) != recorded:
         how = "fit again, or accept it with --program PATH"
-        raise RunError(f"{folder}: its program {name} changed since the fit: {how}")
+        raise RunError(f"{folder}: its model {name} changed since the fit: {how}")
     return load_program(f"{file}:{class_name}")
 
 

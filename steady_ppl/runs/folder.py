@@ -152,7 +152,7 @@ def write_record(folder: Path, record: dict[str, Any]) -> None:
 def require_same(folder: Path, begun: Mapping[str, Any]) -> None:
     """Refuse to go on with a run whose inputs were others; the RunError names the first that was."""
     before = read_record(folder)
-    inputs = {"program": "program", "table_sha256": "training table", "valid_sha256": "--valid table"}
+    inputs = {"program": "model", "table_sha256": "training table", "valid_sha256": "--valid table"}
     for key, what in inputs.items():
         if before.get(key) != begun[key]:
             raise RunError(f"{folder}: --resume needs the same {what}; it is another or has changed")

@@ -213,11 +213,12 @@ def forecast(
     """Draw what happens, and what is measured, after a moment up to which measurements are used.
 
     Args:
-        data: drives with the program's columns; rows after the last measurement hold what is planned.
+        data: trajectories with the program's columns; rows after the last measurement hold what is planned.
         controls: more of it, `(H, U)` or `(H, B, U)`, see `Trajectories.continued`.
-        after: s since each drive's start; later measurements are not used. Each drive's last measured row when None.
+        after: s since each trajectory's start; later measurements are not used. Each trajectory's last measured row
+            when None.
         step: s between the rows of `controls`.
-        draws: equally weighted futures of each drive; parameters are those of the program, without their doubt.
+        draws: equally weighted futures of each trajectory; parameters are those of the program, without their doubt.
         particles: N of the filter, for each trajectory; None: see `choose_filter`.
         known_start: start at the true first state.
         seed: the same seed gives the same draws.
@@ -229,7 +230,7 @@ def forecast(
         measured in them, `measured_…`, of which nothing was used.
 
     Raises:
-        DataError: a drive has no row after that moment, or a moment before its first row.
+        DataError: a trajectory has no row after that moment, or a moment before its first row.
     """
     table = data if controls is None else data.continued(controls, step)
     run = for_program(program, table)

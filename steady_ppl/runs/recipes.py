@@ -91,7 +91,7 @@ def suited_recipe(
         return "steady", f"{count} learnable numbers, where likelihood takes 1 to {MAX_LEARNABLE_NUMBERS}"
     problem = Problem.of_table(program, table, known_start)
     try:
-        require_linear(problem, "likelihood needs a program that can be linearised")
+        require_linear(problem, "likelihood needs a model that can be linearised")
     except UsageError as error:
         return "steady", str(error)
     return "likelihood", f"{count} learnable numbers and noise that can be linearised; --recipe steady takes any"

@@ -100,7 +100,7 @@ UNITS = {
     "us": ("s", 1e-6),
     "ns": ("s", 1e-9),
 }
-"""As they are written, in small letters → of programs, and how many of these one is."""
+"""As they are written, in small letters → of models, and how many of these one is."""
 FINE = {"milliseconds": "ms", "microseconds": "us", "nanoseconds": "ns"}
 MIN_READINGS = 20  # by which a standard deviation can be told
 SD_OF_THIRD_DIFFERENCE = math.sqrt(20.0)  # of white noise of one

@@ -101,7 +101,7 @@ def write_model(
         controls: the names in the table of the vehicle's controls, in its order.
         sensors: with all settings.
         landmarks: m.
-        fastest: m/s, that it is commanded or measured to go; a drive may begin so fast.
+        fastest: m/s, that it is commanded or measured to go; a trajectory may begin so fast.
         force: overwrite a file.
 
     Returns:
@@ -203,7 +203,7 @@ class _Text:
 
     @staticmethod
     def _start(sensors: Sequence[Sensor]) -> str:
-        told = "each drive begins about there; `initial` says how far from it"
+        told = "each trajectory begins about there; `initial` says how far from it"
         return "" if _sees_landmarks_alone(sensors) else f'\n    start = "{FIRST_MEASUREMENTS}"  # {told}'
 
     def _without_settings(self, sensors: Sequence[Sensor]) -> set[str]:

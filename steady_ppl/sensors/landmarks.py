@@ -18,7 +18,7 @@ class _OfLandmarks(Sensor):
     def columns(self, program: Any) -> tuple[str, ...]:
         if not len(program.landmarks):
             about = f"its sensor {self.name} needs `landmarks`, and it has none"
-            raise ProgramError(f"program {type(program).__name__}: {about}", site="sensors")
+            raise ProgramError(f"model {type(program).__name__}: {about}", site="sensors")
         return tuple(f"{self.name}_{index} [{self.unit}]" for index in range(len(program.landmarks)))
 
 

@@ -17,7 +17,7 @@ from steady_ppl.errors import ProgramError
 from steady_ppl.model.distributions import WrappedNormal
 
 Setting = float | Sequence[float] | str
-"""A number, or the name of one of the program's parameters or constants, which may then be learned."""
+"""A number, or the name of one of the model's parameters or constants, which may then be learned."""
 
 
 def _is_number(value: Any) -> bool:
@@ -95,7 +95,7 @@ class Sensor(ABC):
         reading, sd = self.reading(program, state), setting(program, self.sd, state)
         if isinstance(sd, Tensor) and sd.dim() and sd.shape[-1] not in (1, reading.shape[-1]):
             about = f"sensor {self.name} has {sd.shape[-1]} standard deviations for {reading.shape[-1]} columns"
-            raise ProgramError(f"program {type(program).__name__}: its {about}", site="sensors")
+            raise ProgramError(f"model {type(program).__name__}: its {about}", site="sensors")
         return kind(reading, sd).to_event(1)
 
     def observe(self, program: Any, state: Tensor) -> None:
@@ -122,6 +122,6 @@ def setting(program: Any, value: Setting, like: Tensor) -> Any:
     if isinstance(value, str):
         if not hasattr(program, value):
             said = f"its sensor names {value!r}, which it does not have"
-            raise ProgramError(f"program {type(program).__name__}: {said}", site="sensors")
+            raise ProgramError(f"model {type(program).__name__}: {said}", site="sensors")
         value = getattr(program, value)
     return value if isinstance(value, float | int | Tensor) else like.new_tensor(value)

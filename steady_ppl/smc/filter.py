@@ -240,8 +240,8 @@ def _raise_if_broken(program: Program, log_likelihood: Tensor, blown_up: Tensor,
         label, time = data.labels[drive], float(data.elapsed[row, drive])
         impossible = bool(log_likelihood[row, drive] == -math.inf) and not bool(blown_up[: row + 1, drive].any())
         what = divergence(program, data.subset([drive]), row) or (
-            "every particle's weight is zero: the measurement is impossible under the program"
+            "every particle's weight is zero: the measurement is impossible under the model"
             if impossible
-            else "no particle is left that is a number: the program's parameters or states have blown up"
+            else "no particle is left that is a number: the model's parameters or states have blown up"
         )
         raise FilterError(f"trajectory {label} at {time:.3g} s: {what}", trajectory=label, time=time)

@@ -195,5 +195,5 @@ class Filtered:
 
 def degeneracy_note(roots: float) -> str | None:
     """What is to be said where so many of the particles' starts survive a drive: all paths begin alike."""
-    few = f"of the particles' starts {roots:.0f} survive a drive: raise particles"
+    few = f"of the particles' starts {roots:.0f} survive a trajectory: raise particles"
     return few if roots < MIN_EFFECTIVE_SIZE else None

@@ -32,7 +32,7 @@ def simulate(
     like: Trajectories | None = None,
     substeps: int | None = None,
 ) -> Trajectories:
-    """Simulate drives of a program in fine steps, with measurements and the true states.
+    """Simulate trajectories of a program in fine steps, with measurements and the true states.
 
     Controls and noise are held over a row. A row is cut into substeps that are no longer than the program's
     `simulated_step`, 5 ms unless it says otherwise; where `transition` is no step in `step`, into the program's own.
@@ -41,7 +41,7 @@ def simulate(
         program: what moves and what is measured.
         trajectories: how many; the program's `duration`, `step` and `example_controls` apply.
         seed: the same seed gives the same table.
-        like: take time, controls and gaps in the measurements from these drives instead.
+        like: take time, controls and gaps in the measurements from these trajectories instead.
         substeps: of a row, instead.
 
     Raises:
@@ -77,7 +77,7 @@ def simulate(
         path = torch.cat(states)
         for row, drive in (~path.isfinite().all(-1) & run.rows).nonzero()[:1].tolist():
             where = f"trajectory {run.labels[drive]}, row {row + 1}"
-            what = f"program {type(program).__name__} diverges: in {where}, its states are not finite"
+            what = f"model {type(program).__name__} diverges: in {where}, its states are not finite"
             raise ProgramError(what, site="transition")
         measurements = measure(program, path)
     return replace(
@@ -151,7 +151,7 @@ def measure(program: Program, states: Tensor) -> Tensor:
 
 def _example_controls(program: Program, time: Tensor) -> Tensor:
     """What the program's own method gives, `(rows, trajectories, controls)`, checked."""
-    about, site = f"program {type(program).__name__}: example_controls", "example_controls"
+    about, site = f"model {type(program).__name__}: example_controls", "example_controls"
     expected = (*time.shape, len(program.controls))
     try:
         controls = program.example_controls(time)

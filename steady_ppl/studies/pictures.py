@@ -23,7 +23,7 @@ from steady_ppl.utils.text import printable
 
 SIZE_EDGES = (-1.0, 0.0, *(1.25 ** (place - 0.5) for place in range(-6, 12)), math.inf)
 """Ends of ranges of what is missing, in detection limits: each a quarter wider than the one before, one of them around
-a limit; the first is of drives that lack nothing."""
+a limit; the first is of trajectories that lack nothing."""
 SHARE_COLUMNS = ("found", "right", "in_class")
 PUBLISHED = "published"  # in the legend
 PUBLISHED_LOOK: dict[str, Any] = {"ls": "--", "marker": "*", "ms": 7, "lw": 0.9, "alpha": 0.6}

@@ -167,7 +167,7 @@ def _labelled(jobs: tuple[Job, ...]) -> tuple[Job, ...]:
 def _require_columns(picture: Picture, task: str, jobs: tuple[Job, ...]) -> None:
     """What would otherwise be met when everything has been computed."""
     if picture.chosen_by not in ("", HELD_OUT):
-        raise UsageError(f"picture: chosen_by is {picture.chosen_by}, expected {HELD_OUT}: of drives that are held out")
+        raise UsageError(f"picture: chosen_by is {picture.chosen_by}, expected {HELD_OUT}: of held-out trajectories")
     if picture.chosen_by and not picture.x.startswith("data."):
         raise UsageError(f"picture: chosen_by picks settings for the same data; x is {picture.x}, expected data.…")
     rows = [job.columns for job in jobs]

@@ -56,10 +56,10 @@ def read_checkpoint(path: Path, state: Checkpoint, optimizer: torch.optim.Optimi
             raise damaged(path, f"no checkpoint has {shown(key, 100)}")
         groups[group][name] = value
     if _shapes(groups["parameters"]) != _shapes(state.parameters):
-        raise RunError(f"{path.name} in {path.parent} was written by a program with other parameters")
+        raise RunError(f"{path.name} in {path.parent} was written by a model with other parameters")
     for group in ("averaged", "kept") if groups["kept"] else ("averaged",):
         if _shapes(groups[group]) != _shapes(state.averaged):
-            raise damaged(path, f"the {group} parameters are others than the program's")
+            raise damaged(path, f"the {group} parameters are others than the model's")
     if broken := [name for name, value in groups["parameters"].items() if not value.isfinite().all()]:
         raise damaged(path, f"the parameters {', '.join(broken)} are not finite")
     numbers = _numbers(path, text)

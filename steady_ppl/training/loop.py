@@ -111,14 +111,14 @@ class Trained:
 
     @property
     def rise(self) -> tuple[float, float] | None:
-        """Held-out log p(y) of a drive at first and at the step that was kept; None where it was not judged there."""
+        """Held-out log p(y) of a trajectory at first and at the step that was kept; None where it was not judged."""
         judged = {entry["step"]: entry["log_likelihood"] for entry in self.history if "log_likelihood" in entry}
         return (next(iter(judged.values())), judged[self.kept]) if self.kept in judged else None
 
     @property
     def still_rising(self) -> float | None:
-        """By how many nats a drive held-out log p(y) rose over the last quarter, if more than `MAX_FINAL_GAIN` and its
-        end was kept; None where it had settled, or where fewer than three validations cannot tell."""
+        """By how many nats a trajectory held-out log p(y) rose over the last quarter, if more than `MAX_FINAL_GAIN` and
+        its end was kept; None where it had settled, or where fewer than three validations cannot tell."""
         judged = [(entry["step"], entry["log_likelihood"]) for entry in self.history if "log_likelihood" in entry]
         if len(judged) < 3 or self.interrupted or judged[-1][0] != self.kept:
             return None
@@ -141,7 +141,7 @@ def train(
     resume: bool = False,
     progress: bool = True,
 ) -> Trained:
-    """Fit the program's (and the guide's) parameters; the program ends with averaged ones chosen on held-out drives.
+    """Fit the program's (and the guide's) parameters; the program ends with averaged ones, chosen by held-out data.
 
     Alternates the guide's E step with gradient steps on Pyro's ELBO. For a `PathGuide` that ELBO is STEADY's M-step
     objective (IROS 2022, equation 6); for a guide with parameters it is SVI. Of the validated parameters the latest is
@@ -231,7 +231,7 @@ def _in_words(figures: Mapping[str, float], steps: int = 0) -> str:
 
 def _require_finite_gradient(name: str, value: Tensor, step: int) -> None:
     if value.grad is not None and not bool(torch.isfinite(value.grad).all()):
-        how = "look for a square root, a division or a norm at zero in the program, or for roll-outs that diverge"
+        how = "look for a square root, a division or a norm at zero in the model, or for roll-outs that diverge"
         raise TrainingError(f"the gradient of {parameter_name(name)} is not finite at step {step + 1}: {how}")
 
 
@@ -286,7 +286,7 @@ def _groups(program: Program, guide: Guide, own: Iterable[Tensor], optimization:
 
 def _require_finite(loss: Tensor, step: int) -> None:
     if not bool(torch.isfinite(loss)):
-        how = "lower the learning rate, or look at the program's densities (a standard deviation of zero?)"
+        how = "lower the learning rate, or look at the model's densities (a standard deviation of zero?)"
         raise TrainingError(f"the loss is {loss.item()} at step {step + 1}: {how}")
 
 
@@ -313,7 +313,7 @@ class Validation:
     @property
     def notes(self) -> list[str]:
         """What a fit should say of it."""
-        said = f"held-out drives were judged by the bootstrap filter at every tenth row: {self.reason}"
+        said = f"held-out trajectories were judged by the bootstrap filter at every tenth row: {self.reason}"
         return [] if self.reason is None else [said]
 
     @classmethod
@@ -323,7 +323,7 @@ class Validation:
         """Looking ahead at every row where the program's noise is normal, else by the bootstrap at every tenth.
 
         Args:
-            table: the held-out drives, if there are any.
+            table: the held-out trajectories, if there are any.
             particles: N; 100 looking ahead and 2000 otherwise when not given.
         """
         if table is None:

@@ -20,10 +20,10 @@ html: Callable[[object], str] = repr
 """The HTML that a notebook shows of a value: `plotting.notebook`."""
 
 attach_listed: Callable[[object], object]
-"""Give a program the effects that its class lists: `effects.attach`."""
+"""Give a model the effects that its class lists: `effects.attach`."""
 
 with_effect: Callable[Concatenate[Value, ...], Value]
-"""A copy of a program with an effect: `effects.attach`."""
+"""A copy of a model with an effect: `effects.attach`."""
 
 
 @contextmanager

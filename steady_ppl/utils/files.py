@@ -89,7 +89,7 @@ def finite_json(
     try:
         return json.dumps(content, indent=indent, separators=separators, allow_nan=False)
     except ValueError as error:
-        raise ComputationError(f"{place} is not written: a figure is not finite, the program diverges") from error
+        raise ComputationError(f"{place} is not written: a figure is not finite, the model diverges") from error
 
 
 def read_toml(path: Path) -> dict[str, Any]:

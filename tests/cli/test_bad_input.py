@@ -59,10 +59,10 @@ def test_a_bad_table_in_an_evaluation_is_refused(tmp_path: Path, work: Path, ref
 BAD_PROGRAMS = [
     pytest.param("import nowhere\n", "line 1 of boat.py: ModuleNotFoundError", id="import"),
     pytest.param("\n\nclass Boat(:\n", "line 3 of boat.py: SyntaxError", id="syntax"),
-    pytest.param("x = 1\n", "boat.py has no program Boat", id="no class"),
+    pytest.param("x = 1\n", "boat.py has no model Boat", id="no class"),
     pytest.param(
         "from steady_ppl import Program\nclass Boat(Program):\n    states = measurements = ('x',)\n",
-        "program Boat lacks the method initial(self)",
+        "model Boat lacks the method initial(self)",
         id="no method",
     ),
     pytest.param(
@@ -94,7 +94,7 @@ def test_a_class_that_is_no_complete_program_is_refused(tmp_path: Path, refused)
     refused(2, says, "fit", neural, written(tmp_path / "t.csv"), "--out", tmp_path / "run")
     refused(
         2,
-        "no program Boat; its programs: Hovercraft, HovercraftTruth",
+        "no model Boat; its models: Hovercraft, HovercraftTruth",
         "simulate",
         f"{HOVERCRAFT}:Boat",
         "--out",

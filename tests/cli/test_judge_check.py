@@ -60,7 +60,7 @@ def test_a_stretch_that_nobody_measured_is_named_and_masked(work: Path, tmp_path
     write_table(replace(data, states=states), table)
     assert steady("check", work / "hand", table, *FAST, "--mask", kept, "--json", figures) == 0
     said = capsys.readouterr()
-    assert "the table: drive 2 between 1.00 and 2.50 s: x.x, x.y on a straight line" in said.out
+    assert "the table: trajectory 2 between 1.00 and 2.50 s: x.x, x.y on a straight line" in said.out
     assert f"{kept}: gap.csv without 1 unmeasured stretch and 0 wrong readings" in said.err
     (one,) = json.loads(figures.read_text())["stuck"]
     assert one["trajectory"] == "2" and one["seconds"] == pytest.approx([1.0, 2.5])

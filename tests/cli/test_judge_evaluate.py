@@ -67,10 +67,10 @@ def test_particles_that_collapse_are_said(tmp_path: Path, capsys) -> None:
     said = capsys.readouterr().err
     found = json.loads((tmp_path / "found.json").read_text())["runs"][0]["scarce"]
     assert found["particles"] == 50 and 0.5 < found["share"] <= 1
-    after = f"after {found['share']:.0%} of drive {found['trajectory']}'s measured rows"
+    after = f"after {found['share']:.0%} of trajectory {found['trajectory']}'s measured rows"
     assert f"{after} fewer than 10 of the filter's 50 particles" in said
     assert steady("states", run, table, "--particles", 50, "--out", tmp_path / "states.csv") == 0
-    assert "starts 1 survive a drive: raise particles" in capsys.readouterr().err
+    assert "starts 1 survive a trajectory: raise particles" in capsys.readouterr().err
 
 
 def test_particles_that_suffice_are_passed_over(work: Path, capsys) -> None:
@@ -157,7 +157,7 @@ def test_a_map_that_does_not_suit_a_run_is_refused_before_anything_is_computed(
     drives = written(tmp_path / "cart.csv", simulated("linear_gaussian"))
     Fit(example("linear_gaussian"), "hand").save(cart)
     few.write_text(HOVERCRAFT.read_text().replace(", (6.0, 7.0))", ")"))
-    says = f"{cart}: program LinearGaussian has no landmarks"
+    says = f"{cart}: model LinearGaussian has no landmarks"
     refused(2, says, "evaluate", cart, drives, "--map", HOVERCRAFT)
     says = f"{run}: the map is another vehicle's: Truck has the controls speed, turn, Hovercraft has left, right"
     refused(2, says, "evaluate", run, work / "train.csv", "--map", MODELS / "truck.py")

@@ -32,7 +32,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_medians_and_intervals_are_those_of_the_draws(run: Path, suffix: str, capsys) -> None:
     out = run / f"states{suffix}"
     assert steady("states", run / "r", run / "t.csv", "--draws", 20, "--out", out) == 0
-    assert f"{out}: 3 drives, 20 draws of each" in capsys.readouterr().out
+    assert f"{out}: 3 trajectories, 20 draws of each" in capsys.readouterr().out
     frame = pd.read_csv(out) if suffix == ".csv" else pd.read_parquet(out)
     assert len(frame) == 13 + 9 + 13
     assert list(frame.columns[:5]) == ["trajectory", "time", "x", "x_low", "x_high"] and len(frame.columns) == 2 + 18

@@ -83,7 +83,7 @@ def test_add_refuses_in_one_line(work: Path, refused) -> None:
     run, new, model = work / "run", work / "new.py", work / "hovercraft.py"
     refused(2, "did you mean linear_drag?", "add", run, "liner_drag", "--out", new)
     refused(2, "has no effect that its file does not have", "add", run, "--out", new)
-    refused(2, "--program names the program of a RUN", "add", model, "slope", "--out", new, "--program", model)
+    refused(2, "--program names the model of a RUN", "add", model, "slope", "--out", new, "--program", model)
     refused(2, "no file", "add", work / "nothing.py", "slope", "--out", new)
     refused(2, "takes 2 numbers", "add", model, "slope=1", "--out", new)
     assert steady("add", model, "slope", "--out", work / "t.csv") == 2
@@ -99,4 +99,4 @@ def test_effects_lists_the_catalogue_and_what_a_program_cannot_lack(capsys) -> N
     assert steady("effects", MODELS / "truck.py") == 0
     out = capsys.readouterr().out
     assert "| `curvature_steering` |" in out and "| `wind` |" not in out
-    assert "- `wind`: the program holds the lateral velocity at zero" in out
+    assert "- `wind`: the model holds the lateral velocity at zero" in out

@@ -53,7 +53,7 @@ def test_a_model_is_fitted_searched_and_kept(table, tmp_path, capsys):
     said = capsys.readouterr().out
     assert json.loads(printed)["sentence"] == json.loads(figures.read_text())["sentence"]
     assert said.startswith("The dynamics lack yaw_bias = 0.")
-    assert "6 of the 12 drives were kept" in said
+    assert "6 of the 12 trajectories were kept" in said
     content = json.loads(figures.read_text())
     assert content["verdict"] == "dynamics" and "yaw_bias" in content["class"]
     assert picture.stat().st_size > 10_000
@@ -66,7 +66,7 @@ def test_a_model_is_fitted_searched_and_kept(table, tmp_path, capsys):
 
 def test_what_cannot_be_searched_is_said_in_a_line(tmp_path, capsys):
     few = written(tmp_path / "few.csv", simulated(trajectories=4, rows=20))
-    assert "4 drives are too few: 10 are needed" in refused(capsys, "discover", HOVERCRAFT, few)
+    assert "4 trajectories are too few: 10 are needed" in refused(capsys, "discover", HOVERCRAFT, few)
     network = f"{MODELS / 'neural_vehicle.py'}:NeuralHovercraft"
     enough = written(tmp_path / "enough.csv", simulated(trajectories=12, rows=20))
     said = refused(capsys, "discover", network, enough)
@@ -80,7 +80,7 @@ def test_drives_that_both_tables_have_are_refused(tmp_path, capsys):
     one = written(tmp_path / "one.csv", drives.subset(range(6)))
     other = written(tmp_path / "other.csv", drives.subset(range(3, 8)))
     said = refused(capsys, "discover", HOVERCRAFT, one, "--valid", other)
-    assert "3 of the validation drives are training drives as well (4, 5, 6)" in said
+    assert "3 of the validation trajectories are training trajectories as well (4, 5, 6)" in said
 
 
 def test_drives_of_saturated_sensors_are_not_taken_for_one_drive():

@@ -39,7 +39,7 @@ def test_fit_tells_the_held_out_likelihood(tmp_path: Path, work: Path, capsys) -
     tables = (work / "train.csv", "--valid", work / "valid.parquet")
     assert steady("fit", HOVERCRAFT, *tables, *FEW, "--out", tmp_path / "run") == 0
     (entry,) = json.loads((tmp_path / "run/run.json").read_text())["history"]
-    assert f"held-out log p(y) of a drive {entry['log_likelihood']:.2f} → " in capsys.readouterr().out
+    assert f"held-out log p(y) of a trajectory {entry['log_likelihood']:.2f} → " in capsys.readouterr().out
 
 
 def test_fit_says_that_nothing_is_held_out(tmp_path: Path, work: Path, capsys) -> None:

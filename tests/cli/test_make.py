@@ -225,7 +225,7 @@ def test_the_command_cuts_and_says_what_it_left_out(tmp_path, capsys):
     table = written(tmp_path / "log.csv", simulated(trajectories=2, rows=31))
     assert steady("data", "cut", table, "--seconds", 1, "--out", tmp_path / "cut.csv") == 0
     out, error = capsys.readouterr()
-    assert out == f"{tmp_path / 'cut.csv'}: 6 drives\n" and "2 rows left out" in error
+    assert out == f"{tmp_path / 'cut.csv'}: 6 trajectories\n" and "2 rows left out" in error
     assert len(read_table(tmp_path / "cut.csv")) == 6
     assert steady("data", "cut", table, "--seconds", 0, "--out", tmp_path / "no.csv") == 2
     assert not (tmp_path / "no.csv").exists()

@@ -77,5 +77,5 @@ def test_maps_of_different_sizes_are_not_compared() -> None:
 
 def test_a_vehicle_without_landmarks_has_no_map() -> None:
     fixed = type("Fixed", (type(load_program(HOVERCRAFT)),), {"landmarks": (), "measurements": ("bearing_0",)})
-    with pytest.raises(UsageError, match="program Fixed has no landmarks"):
+    with pytest.raises(UsageError, match="model Fixed has no landmarks"):
         evaluate(Fit(fixed(), "hand"), simulated(rows=9), surveyed=fixed())

@@ -134,7 +134,8 @@ def test_the_same_program_twice_differs_by_nothing(dragged):
     changes += [c for kind in ("measurement", "state") for errors in against[kind].values() for c in errors.values()]
     assert len(changes) > 10
     assert all(change["difference"] == 0 and change["interval"] == [0, 0] for change in changes)
-    assert found.figures["verdict"].startswith("two is not shown to be better than one: log p(y) +0.0 nats a drive")
+    expected = "two is not shown to be better than one: log p(y) +0.0 nats a trajectory"
+    assert found.figures["verdict"].startswith(expected)
 
 
 def test_a_particle_filter_agrees_on_a_linear_program_and_nearly_on_bearings(drag, carts):
@@ -150,11 +151,12 @@ def test_a_drive_that_the_linearised_program_misjudges_is_named(drag, dragged):
     left[3], left[7] = -4.0, 2.5
     rows = {"after": replace(drag.rows["after"], neglected=left)}
     assert doubtful(rows, dragged) == [
-        "after: on drive 4 a particle filter's log p(y) is 4.0 nats below the linearised program's (1 other likewise): "
-        "look at it before you trust the table"
+        "after: on trajectory 4 a particle filter's log p(y) is 4.0 nats below the linearised model's "
+        "(1 other likewise): look at it before you trust the table"
     ]
     left[5] = torch.nan
-    assert "on drive 6 a particle filter's log p(y) is not comparable with the linearised" in doubtful(rows, dragged)[0]
+    says = "on trajectory 6 a particle filter's log p(y) is not comparable with the linearised"
+    assert says in doubtful(rows, dragged)[0]
     rows = {"after": replace(drag.rows["after"], neglected="it broke down")}
     assert doubtful(rows, dragged)[0].endswith("can be trusted: it broke down")
 
@@ -278,7 +280,7 @@ def test_what_cannot_be_proved_is_refused(cart):
         prove(rows, replace(data, observed=torch.zeros_like(data.observed)))
     with pytest.raises(st.DataError, match="no x. columns"):
         prove(rows, data.without_truth(), known_start=True)
-    with pytest.raises(st.UsageError, match="got 1 program"):
+    with pytest.raises(st.UsageError, match="got 1 model"):
         prove({"one": cart}, data)
     with pytest.raises(st.UsageError, match="there is no row 'three'; the rows are one, two"):
         prove(rows, data, truth="three")
@@ -299,7 +301,7 @@ def test_a_program_that_cannot_be_linearised_is_named(cart):
             return st.stack(position + velocity * step, velocity + acceleration * step)
 
     rows = {"cart": cart, "heavy": Heavy().double().requires_grad_(False)}
-    with pytest.raises(st.UsageError, match="heavy: prove needs programs that can be linearised: .*StudentT"):
+    with pytest.raises(st.UsageError, match="heavy: prove needs models that can be linearised: .*StudentT"):
         prove(rows, drives(cart, 5, 12))
 
 
@@ -331,7 +333,7 @@ def test_the_command_refuses_without_touching_a_file(tmp_path, work, refused, ca
     refused(2, "at least one RUN and then a TABLE", "prove", table)
     refused(2, "ends in one of", "prove", *runs, table, "--picture", tmp_path / "proof.nonsense", "--json", kept)
     refused(2, "cannot be told apart", "prove", work / "hand", work / "hand", table)
-    refused(2, "got 1 program", "prove", work / "hand", table)
+    refused(2, "got 1 model", "prove", work / "hand", table)
     refused(2, "--program is given 1 times for 2 runs", "prove", *runs, table, "--program", TRUTH)
     before = contents(tmp_path)
     assert steady("prove", *runs, table, "--json", tmp_path / "nowhere" / "proof.json") == 2
@@ -365,7 +367,7 @@ def test_particles_rule_where_they_see_log_p_y_otherwise(drag) -> None:
     gain = line(drag, "after")["against_reference"]["log_likelihood"]["difference"]
     said = by_particles(drag, "after", -gain - 50.0).figures["verdict"]
     assert said.startswith("after fits worse and predicts better than before: log p(y) by particles (linearised +")
-    assert "−50.0 nats a drive" in said
+    assert "−50.0 nats a trajectory" in said
     assert "particles" not in by_particles(drag, "after", 0.5).figures["verdict"]
     assert (
         by_particles(drag, "after", 20.0).figures["verdict"].startswith("after is better than before: log p(y) by par")

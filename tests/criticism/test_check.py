@@ -287,7 +287,7 @@ def test_drives_of_different_rates_are_said_to_be(cart, even):
     faster = even.time.clone()
     faster[:, 1] *= 0.5
     notes = st.check(fitted(cart, known_start=False), replace(even, time=faster), simulations=20).notes
-    assert "the drives' steps differ" in notes[0] and "rows of" in notes[0]
+    assert "the trajectories' steps differ" in notes[0] and "rows of" in notes[0]
 
 
 def test_a_component_that_is_never_measured_has_no_figures():
@@ -337,7 +337,7 @@ def test_a_program_whose_noise_is_not_normal_is_refused(cart, even):
             acceleration = pyro.sample("acceleration", dist.StudentT(3.0, 0.0 * velocity, self.noise))
             return st.stack(position + velocity * step, velocity + acceleration * step)
 
-    with pytest.raises(st.UsageError, match="check needs a program that can be linearised: .*StudentT"):
+    with pytest.raises(st.UsageError, match="check needs a model that can be linearised: .*StudentT"):
         st.check(fitted(Heavy().double().requires_grad_(False)), even)
 
 
@@ -368,7 +368,7 @@ def test_what_a_fit_could_not_know_is_no_fault(off) -> None:
     open_ = st.check(known_by(fit, for_program(fit.program, others), 0.1), data, simulations=40)
     assert open_.is_open and TAKEN_AS_EXACT not in open_.notes and open_.blame.p_values["parameters"] > 0.05
     assert open_.figures["parameter_uncertainty"] is True
-    assert "noise and fit" in str(open_) and "bands hold what its own drives leave open" in str(open_)
+    assert "noise and fit" in str(open_) and "bands hold what the fit's own leave open" in str(open_)
     assert "noise alone" in str(sure) and "bands hold" not in str(sure)
 
 
@@ -379,7 +379,7 @@ def test_on_its_own_drives_a_fits_uncertainty_does_not_count(off) -> None:
     masked = st.check(
         known_by(fit, for_program(fit.program, data), 0.1), data.subset([1]), has_seen=False, simulations=20
     )
-    assert masked.is_open and any("1 of these drives are the fit's own" in note for note in masked.notes)
+    assert masked.is_open and any("1 of these trajectories are the fit's own" in note for note in masked.notes)
 
 
 def test_numbers_that_lead_anywhere_are_taken_as_exact(off) -> None:
@@ -396,7 +396,7 @@ def test_numbers_that_lead_anywhere_are_taken_as_exact(off) -> None:
     [
         (
             0.01,
-            "although the fit has converged: these drives are of another vehicle, or an effect is missing;",
+            "although the fit has converged: these trajectories are of another vehicle, or an effect is missing;",
         ),
         (7.0, "and the fit has not converged (a longer one gains 7 nats, linearised): fit it again first"),
     ],

@@ -83,7 +83,7 @@ def test_a_step_that_is_too_coarse_is_told_by_its_gain(steps_of_turning) -> None
     last = found.trials[-1].log_likelihood - found.trials[-2].log_likelihood
     assert last > 3 and not found.settled
     assert found.sentence == (
-        f"the program's own time step is too coarse: 32 substeps a row instead of 1 gain {found.gain:.0f} nats, "
+        f"the model's own time step is too coarse: 32 substeps a row instead of 1 gain {found.gain:.0f} nats, "
         f"the last doubling {last:.0f} of them: more substeps may gain more (fit with --substeps 32)"
     )
     for trial, finer in zip(found.trials[:-1], found.trials[1:], strict=True):
@@ -156,7 +156,7 @@ def test_parameters_that_a_coarse_step_has_bent_do_not_acquit_it(inductance, wit
         found = check_step(program, data, maximum, finest=128)
     assert found.gain > 200 and 8 <= found.suited.substeps <= within
     assert float(found.suited.program.inductance.detach()) == pytest.approx(inductance, rel=0.05)
-    assert found.sentence.startswith("the program's own time step is too coarse: ")
+    assert found.sentence.startswith("the model's own time step is too coarse: ")
 
 
 def stubbed(monkeypatch, levels, *, at=True, looks=5.0):
@@ -241,7 +241,7 @@ def test_the_second_order_step_is_fine_enough_for_the_hovercraft_and_explicit_eu
     assert not checked(example("hovercraft", torch.float32), table, known_start=True).too_coarse
     found = checked(example("paper:PaperHovercraft", torch.float32), table, known_start=True)
     assert found.settled and found.sentence == (
-        f"the program's own time step is too coarse: {found.suited.substeps} substeps a row instead of 1 gain "
+        f"the model's own time step is too coarse: {found.suited.substeps} substeps a row instead of 1 gain "
         f"{found.gain:.0f} nats (fit with --substeps {found.suited.substeps})"
     )
 
@@ -267,14 +267,14 @@ def test_check_says_the_step_first(turning) -> None:
     with seeded(0, "paths"):
         fit_by_likelihood(program, for_program(program, turning))
     found = check(Fit(program, "likelihood"), in_continuous_time(Unicycle(), 6, seed=4), simulations=40)
-    assert str(found).startswith("The program's own time step is too coarse: ")
+    assert str(found).startswith("The model's own time step is too coarse: ")
     assert found.figures["step"]["substeps"] == found.step.suited.substeps > 1
 
 
 @pytest.mark.exhaustive
 def test_discover_goes_on_at_the_step_that_suits_and_names_no_effect(turning, tmp_path) -> None:
     found = discover(Turning(), in_continuous_time(Unicycle(), 12, seed=5), in_continuous_time(Unicycle(), 12, seed=6))
-    assert str(found).startswith("The program's own time step is too coarse: ")
+    assert str(found).startswith("The model's own time step is too coarse: ")
     assert found.verdict == "none"
     assert found.after.program.substeps == found.search.step.suited.substeps >= 4
     assert found.figures["step"]["gain"] > 3
@@ -309,7 +309,7 @@ def test_the_exact_unicycle_lacks_nothing_but_a_finer_step(tmp_path, capsys) -> 
     figures = tmp_path / "found.json"
     assert steady("discover", run, train, "--valid", valid, "--json", figures) == 0
     content = json.loads(figures.read_text())
-    assert content["sentence"].startswith("The program's own time step is too coarse: ")
+    assert content["sentence"].startswith("The model's own time step is too coarse: ")
     assert content["verdict"] == "none"
     trials = {trial["substeps"]: trial["log_likelihood"] for trial in content["step"]["trials"]}
     assert trials[content["step"]["substeps"]] / 12 >= 785
@@ -351,7 +351,7 @@ def test_parameters_that_diverge_are_no_trial(change, monkeypatch) -> None:
     monkeypatch.setattr(step_size, "maximise", diverging)
     monkeypatch.setattr(step_size, "MAX_DECREMENT", -1.0)  # finer steps are always fitted
     said = check_step(cart, data)
-    assert len(found) > 2 and "likelihood has no maximum on these drives" in said.uncompared
+    assert len(found) > 2 and "likelihood has no maximum on these trajectories" in said.uncompared
 
 
 @pytest.mark.slow

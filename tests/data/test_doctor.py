@@ -159,7 +159,7 @@ def test_what_logs_ordinarily_hold_is_not_suspicious(clean, tmp_path, what):
 def test_a_label_for_several_drives_gets_new_labels(clean, tmp_path):
     file = written(tmp_path, clean.assign(trajectory="all"))
     (one,) = st.doctor(file).findings
-    assert one.kind == "time" and "one label for several drives" in one.why
+    assert one.kind == "time" and "one label for several trajectories" in one.why
     room = {"table": pd.read_csv(file, dtype={"trajectory": str})}
     exec(one.mend, room)
     assert len(st.read_table(written(tmp_path, room["table"]))) == 5

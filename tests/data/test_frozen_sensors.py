@@ -38,7 +38,7 @@ def test_a_gap_filled_by_interpolation_is_found_to_the_row() -> None:
     (found,) = frozen_stretches(replace(data, states=states))
     assert (found.drive, found.label, found.rows) == (1, data.labels[1], (20, 41))
     assert found.columns == ("x.x", "x.y") and found.seconds == pytest.approx((2.0, 4.1))
-    assert "drive 2 between 2.00 and 4.10 s: x.x, x.y" in str(found)
+    assert "trajectory 2 between 2.00 and 4.10 s: x.x, x.y" in str(found)
 
 
 def test_a_sensor_that_hangs_is_found_and_a_short_rest_is_not() -> None:

@@ -238,8 +238,8 @@ def test_nan_is_a_missing_measurement_and_drives_are_numbered() -> None:
 @pytest.mark.parametrize(
     ("drives", "labels", "said"),
     [
-        ([], None, "got 0 drives and 0 labels"),
-        ([{}], ["a", "b"], "got 1 drives and 2 labels"),
+        ([], None, "got 0 trajectories and 0 labels"),
+        ([{}], ["a", "b"], "got 1 trajectories and 2 labels"),
         (
             [{"time": np.arange(3.0), "y.place": np.ones(2)}],
             None,
@@ -256,7 +256,7 @@ def test_nan_is_a_missing_measurement_and_drives_are_numbered() -> None:
         (
             [{"time": np.arange(2.0)}, {"time": 5 + np.arange(2.0)}],
             ["a", "a"],
-            "2 drives need 2 labels, and a is there",
+            "2 trajectories need as many labels, and a is there",
         ),
         (
             [{"time": np.arange(2.0), "y.b": np.ones((2, 2)), "y.b_0": np.ones(2)}],

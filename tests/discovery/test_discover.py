@@ -81,7 +81,7 @@ def test_a_gain_of_one_drive_is_said_to_be(dragged):
     gain = torch.zeros(2 * DRIVES)
     gain[13] = 9.0
     alone = replace(found, candidate=replace(found.candidate, gain=gain))
-    assert _note_of_one_drive(alone).startswith("without drive 4 of the training drives nothing would be left")
+    assert _note_of_one_drive(alone).startswith("without training trajectory 4 nothing would be left")
 
 
 def test_what_was_found_comes_first_among_the_candidates(dragged):
@@ -146,7 +146,7 @@ def test_the_figures_keep_to_the_schema(dragged, clean):
 def test_the_text_says_the_verdict_first(dragged, clean):
     assert str(dragged).startswith("The dynamics lack quadratic_drag = 0.0")
     assert "a = -c v |v|" in str(dragged) and "open-loop error −" in str(dragged)
-    assert str(clean).startswith("No effect is missing as far as these drives can tell (p = ")
+    assert str(clean).startswith("No effect is missing as far as these trajectories can tell (p = ")
     assert all(len(line) <= 125 for line in str(dragged).splitlines())
 
 

@@ -50,7 +50,7 @@ def test_mixed_tables_are_one_and_every_second_drive_chooses() -> None:
     first, second = found.search.base.folds
     assert first.drives.labels == ("train 1", "train 3", "train 5", "valid 1", "valid 3", "valid 5")
     assert second.drives.labels == ("train 2", "train 4", "train 6", "valid 2", "valid 4")
-    assert "the tables were mixed: 5 of the 11 drives were kept to choose by" in found.notes
+    assert "the tables were mixed: 5 of the 11 trajectories were kept to choose by" in found.notes
     with pytest.raises(st.UsageError, match="mix puts two tables together"):
         st.discover(program, train, known_start=True, mix=True)
 
@@ -83,4 +83,4 @@ def test_a_fault_of_numbers_before_the_first_tests_is_a_line(monkeypatch, error,
     with pytest.raises(raised) as caught:
         _searched(None, None, None)
     if isinstance(error, ZeroDivisionError):
-        assert str(caught.value) == "the program cannot be searched on these drives: ZeroDivisionError: by the tide"
+        assert str(caught.value) == "the model cannot be searched on these trajectories: ZeroDivisionError: by the tide"

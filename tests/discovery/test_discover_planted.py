@@ -43,9 +43,8 @@ def test_wrong_readings_decide_nothing():
     assert [finding.aliases[0] for finding in found.findings] == ["quadratic_drag"]
     assert abs(found.findings[0].coefficient[0] - 0.05) < 4 * found.findings[0].sd[0]
     assert [one["columns"] for one in found.figures["outliers"]] == 2 * [["y.bearing_2"], ["y.bearing_0"]]
-    counts = [
-        int(count) for count in re.findall(r"(\d+) readings of the (?:training|validation) drives left", str(found))
-    ]
+    left = re.findall(r"(\d+) readings of the (?:training|validation) trajectories left", str(found))
+    counts = [int(count) for count in left]
     assert len(counts) == 2 and all(7 <= count <= 9 for count in counts)  # a good one beside a jump may go with it
 
 
@@ -57,7 +56,7 @@ def test_a_sensor_declared_too_coarse_takes_no_effects_place():
     drag, noise = found.findings
     assert drag.aliases[0] == "quadratic_drag" and noise.variant.name == "measurement_noise"
     assert noise.is_correction and noise.interval[0][0] < 0.4 < noise.interval[0][1]
-    assert str(found).startswith("These drives contradict the declared noise: measurement_noise = 0.")
+    assert str(found).startswith("These trajectories contradict the declared noise: measurement_noise = 0.")
     assert [one["correction"] for one in found.figures["effects"]] == [False, True]
 
 
@@ -123,7 +122,7 @@ def test_a_fit_that_has_not_converged_is_said_before_any_ranking(monkeypatch):
     monkeypatch.setattr("steady_ppl.discovery.refits.maximise", partial(maximise, steps=1))
     found = discovered("yaw_bias=0.1")
     assert not found.search.base.converged and NOT_CONVERGED in found.doubts
-    assert str(found).startswith("warning: the program's own fit has not converged")
+    assert str(found).startswith("warning: the model's own fit has not converged")
     assert found.figures["doubts"] == found.doubts
 
 

@@ -132,7 +132,7 @@ def test_filters_of_one_refit_are_asked_once_by_all_judges(monkeypatch):
     for _ in range(2):
         good = ParticleJudge(now).confirm(Fake("a", torch.full((2,), 3.0), refit("a"), is_confirmed=False))
         bad = ParticleJudge(now).confirm(Fake("b", torch.full((2,), 3.0), broken, is_confirmed=False))
-        assert good.total == 6.0 and bad.refit == "no particle filter follows the drives: every weight is zero"
+        assert good.total == 6.0 and bad.refit == "no particle filter follows the trajectories: every weight is zero"
     assert sorted(asked) == [("a", 0), ("a", 0), ("broken", 0), ("now", 0)]
 
 

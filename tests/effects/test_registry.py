@@ -39,7 +39,7 @@ def test_names_are_read(text: str, read) -> None:
         ("hovercraft", "liner_drag", "did you mean linear_drag?"),
         ("hovercraft", "zzz", "there are acceleration_bias, "),
         ("hovercraft", "stiffness", "does not apply to Hovercraft: no channel has a position"),
-        ("truck", "wind", "does not apply to Truck: the program holds the lateral velocity at zero"),
+        ("truck", "wind", "does not apply to Truck: the model holds the lateral velocity at zero"),
         ("truck", "gain_error:left", "no place 'left': it can be at speed, turn"),
         ("hovercraft", "landmark_bias:4", "it can be at bearing_0, "),
         ("hovercraft", "linear_drag:yaw", "no place 'yaw': there is one only"),
@@ -82,7 +82,7 @@ ANGLE = "no control is a turn rate (rad/s), a rudder angle (rad) or a steering a
 LINKAGE = "no control is a rudder angle (rad) or a steering angle (rad): declare one in `roles`, as roles = "
 WHEEL = 'no control is a right wheel\'s speed (m/s): declare one in `roles`, as roles = {"NAME": "right_wheel"}'
 ROLLS = "it needs a speed with a turn rate or a steering angle, or the speeds of two wheels: declare what its controls "
-HELD = "the program holds the lateral velocity at zero"
+HELD = "the model holds the lateral velocity at zero"
 PLANAR = "it acts on vehicles in the plane only"
 
 
@@ -182,5 +182,5 @@ def test_the_page_of_the_catalogue_is_up_to_date() -> None:
     """`steady effects > docs/effects.md` brings it up to date."""
     assert (MODELS.parent / "docs" / "effects.md").read_text() == page()
     truck = page(example("truck"))
-    assert "- `wind`: the program holds the lateral velocity at zero" in truck
+    assert "- `wind`: the model holds the lateral velocity at zero" in truck
     assert "| `landmark_bias` | bearing_0, bearing_1, bearing_2, bearing_3 |" in truck

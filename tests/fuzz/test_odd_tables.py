@@ -120,7 +120,7 @@ def test_numbers_without_measure_end_in_a_line(tmp_path: Path, cart_run: Path, c
 def test_drives_of_two_rows_hold_nothing_to_check(tmp_path: Path, refused) -> None:
     table = written(tmp_path / "t.csv", simulated(trajectories=5, rows=2))
     assert steady("fit", HOVERCRAFT, table, "--recipe", "hand", "--known-start", "--out", tmp_path / "run") == 0
-    refused(2, "take more drives, or longer ones", "check", tmp_path / "run", table, "--simulations", 20)
+    refused(2, "take more trajectories, or longer ones", "check", tmp_path / "run", table, "--simulations", 20)
 
 
 def test_lists_in_a_parquet_table_are_no_numbers(tmp_path: Path, cart_run: Path, refused) -> None:

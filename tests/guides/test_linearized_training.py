@@ -137,7 +137,7 @@ def test_a_search_that_is_lost_for_one_drive_serves_the_others(monkeypatch):
     torch.testing.assert_close(looking.memory["states/2"], right["2"], rtol=0, atol=0.05)
     assert (looking.memory["states/1"] - right["1"]).abs().max() > 2
     looking.memory["noise/1"] = torch.full_like(looking.memory["noise/1"], math.nan)
-    with pytest.raises(FilterError, match="trajectory 1: the linearised program's log p"):  # its path is gone
+    with pytest.raises(FilterError, match="trajectory 1: the linearised model's log p"):  # its path is gone
         looking.refresh(data.subset([0]), 0.6)
 
 
@@ -145,7 +145,7 @@ def test_a_guide_refuses_other_drives_of_the_same_labels():
     program = example("hovercraft:HovercraftTruth").requires_grad_(False)
     looking = GaussianGuide(program, draws=4, known_start=True, tempering=Constant())
     looking.refresh(drives(program, 3, 12), 0.0)
-    with pytest.raises(UsageError, match="remembers other drives of the same labels"):
+    with pytest.raises(UsageError, match="remembers other trajectories of the same labels"):
         looking.refresh(drives(program, 3, 11), 0.1)
 
 

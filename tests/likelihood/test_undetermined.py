@@ -15,7 +15,7 @@ from steady_ppl.model.problem import Problem
 from steady_ppl.runs.fit import Fit
 
 CART = type(example("linear_gaussian"))
-PRODUCT = "these drives tell only the product of gain and torque, not each"
+PRODUCT = "these trajectories tell only the product of gain and torque, not each"
 
 
 class Motor(CART):
@@ -60,9 +60,9 @@ class Idle(CART):
     [
         (CART, []),
         (Motor, [PRODUCT]),
-        (Quotient, ["these drives tell only the ratio of gain and torque, not each"]),
-        (Sum, ["these drives tell wind and slope only together, not each"]),
-        (Idle, ["these drives do not tell spare: many values are as likely"]),
+        (Quotient, ["these trajectories tell only the ratio of gain and torque, not each"]),
+        (Sum, ["these trajectories tell wind and slope only together, not each"]),
+        (Idle, ["these trajectories do not tell spare: many values are as likely"]),
     ],
 )
 def test_combinations_that_drives_do_not_tell_are_named(program, expected, trajectories):

@@ -157,12 +157,10 @@ BROKEN = [
         "line 2 of boat.py: SystemExit: enough",
         id="exit",
     ),
-    pytest.param("", "boat.py has no program Boat; its programs: none (choose with", id="empty"),
-    pytest.param(
-        "class Ship: pass\n", "boat.py has no program Boat; its programs: none (choose with", id="another class"
-    ),
-    pytest.param("class Boat: pass\n", "boat.py has no program Boat", id="no subclass"),
-    pytest.param("def Boat(): pass\n", "boat.py has no program Boat; its programs: none", id="function"),
+    pytest.param("", "boat.py has no model Boat; its models: none (choose with", id="empty"),
+    pytest.param("class Ship: pass\n", "boat.py has no model Boat; its models: none (choose with", id="another class"),
+    pytest.param("class Boat: pass\n", "boat.py has no model Boat", id="no subclass"),
+    pytest.param("def Boat(): pass\n", "boat.py has no model Boat; its models: none", id="function"),
     pytest.param("from steady_ppl import Program as Boat\n", "declares no states", id="the form itself"),
     pytest.param(
         constructed("self", "raise ValueError('one\\ntwo')"),

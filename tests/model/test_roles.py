@@ -60,5 +60,5 @@ def test_a_wrong_declaration_is_named_in_one_line(controls: tuple[str, ...], rol
     for read in (lambda program: controls_of(program, "speed"), probe):
         with pytest.raises(ProgramError) as caught:
             read(driven(*controls, roles=roles))
-        assert says in str(caught.value) and str(caught.value).startswith("program Car: ")
+        assert says in str(caught.value) and str(caught.value).startswith("model Car: ")
         assert "\n" not in str(caught.value)

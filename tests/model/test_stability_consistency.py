@@ -137,7 +137,7 @@ def test_actuators_that_count_rows_are_told_from_others(kind, expected) -> None:
     data = for_program(program, simulate(program, 2, seed=1, substeps=1))
     assert is_step(program, data) is not expected
     if expected:
-        with pytest.raises(ProgramError, match="program RowsLate: actuators counts rows and not seconds"):
+        with pytest.raises(ProgramError, match="model RowsLate: actuators counts rows and not seconds"):
             probe(with_substeps(program, 2))
         found = check_step(program, data, known_start=True)
         assert len(found.trials) == 1

@@ -226,7 +226,7 @@ def fitted(name: str) -> st.Fit:
 def test_a_fit_finds_what_made_the_drives(name: str) -> None:
     """Within four standard deviations of their information, in the space in which they are learned: logarithms."""
     fit, world = fitted(name), WORLDS[name]
-    assert not [note for note in fit.notes if not note.startswith("these drives do not tell noise")]
+    assert not [note for note in fit.notes if not note.startswith("these trajectories do not tell noise")]
     sds = torch.linalg.inv(fit.information.matrix).diagonal().sqrt().tolist()
     for part, sd in zip(elements(fit.program), sds, strict=True):
         if part.owner in world.truth:

@@ -98,7 +98,8 @@ def test_names_from_a_table_are_not_read_as_formulas() -> None:
     for figure in figures:
         figure.canvas.draw()
     written = [text.get_text() for text in figures[-1].findobj(plt.Text) if not text.get_parse_math()]
-    assert set(data.labels) < set(written) and any(text.startswith("measured and predicted, drive") for text in written)
+    assert set(data.labels) < set(written)
+    assert any(text.startswith("measured and predicted, trajectory") for text in written)
 
 
 def test_any_components_are_drawn_by_their_names_and_units(drawn) -> None:
@@ -178,7 +179,7 @@ def test_curves_of_a_fit_are_its_history() -> None:
     [
         (particle_curve, fitted([{"step": 1.0}], guide="gaussian"), "guide gaussian has no particles"),
         (observation_noise, fitted([{"step": 1.0}]), "not tempered"),
-        (held_out_curve, fitted([{"step": 1.0}]), "without held-out drives"),
+        (held_out_curve, fitted([{"step": 1.0}]), "without held-out trajectories"),
         (held_out_curve, Fit(example("hovercraft"), "hand"), "recipe hand does not train"),
     ],
 )

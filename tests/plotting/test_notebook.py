@@ -43,7 +43,7 @@ def test_a_fit_shows_its_parameters_and_how_it_was_judged() -> None:
     history = [{"step": 5.0, "log_likelihood": 1.25}, {"step": 10.0, "log_likelihood": 2.5}]
     fit = st.Fit(example("hovercraft"), "steady", trained=Trained(history, kept=10), notes=["a <note>"])
     html = fit._repr_html_()
-    assert "Hovercraft, fitted by steady" in html and "1.25 → 2.50 nats a drive, kept at step 10" in html
+    assert "Hovercraft, fitted by steady" in html and "1.25 → 2.50 nats a trajectory, kept at step 10" in html
     assert "<td>mass</td><td>1.5</td>" in html and "note: a &lt;note&gt;" in html
     assert "Hovercraft, recipe hand, nothing learned" in st.Fit(example("hovercraft"), "hand")._repr_html_()
     assert repr(fit).startswith("Fit(Hovercraft(mass=1.5") and len(repr(fit)) < 200

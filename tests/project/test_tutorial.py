@@ -63,7 +63,7 @@ def test_it_ends_with_a_program_that_predicts_better_and_a_page(folder: Path) ->
                 (folder / "mine.py").write_text(typed(folder, [name, *words[:2]]))
             else:
                 said[" ".join(words[:2])] = typed(folder, [steady, *words])
-    assert "does not fit these drives" in said["check runs/before"]
+    assert "does not fit these trajectories" in said["check runs/before"]
     assert "lack yaw_linear_drag" in said["discover runs/before"]
     assert "class " in (folder / "mine_after.py").read_text()
     first = re.findall(r"^(before|after) +([−\d.]+)", said["prove runs/before"], re.MULTILINE)[:2]  # rows: log p(y)

@@ -54,7 +54,7 @@ def test_there_is_room_for_the_strongest_drives():
     assert chosen_drives(checks).note is None
     few = chosen_drives(checks, numbers=3 * 101 * 80)
     assert 1 <= len(few.drives) < 6 and few.every == 1 and "strongest misfits" in few.note
-    assert f"{len(few.drives)} of 6 drives" in few.note
+    assert f"{len(few.drives)} of 6 trajectories" in few.note
     tiny = chosen_drives(checks, numbers=500)
     assert len(tiny.drives) == 1 and tiny.every > 1 and "th row" in tiny.note
 
@@ -67,5 +67,5 @@ def test_what_is_shown_row_by_row_has_an_upper_bound():
         shown = chosen_drives(checks, numbers)
         rows = -(-101 // shown.every)
         assert 0.5 * numbers < len(shown.drives) * rows * 100 < 1.5 * numbers
-        assert shown.note and "of 6 drives" in shown.note
+        assert shown.note and "of 6 trajectories" in shown.note
     assert chosen_drives(checks).note is None

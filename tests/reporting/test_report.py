@@ -181,7 +181,7 @@ def test_the_command_that_is_shown_is_the_one_that_was_given(work: Path, tmp_pat
     given = f"steady report {work / 'hand'} {table} --title &#39;my page&#39; --simulations 20 --seed 3 --out {page}"
     assert given in text
     assert "Hovercraft, recipe hand, seed 0, without a known start\nsteady fit " in text  # and by what it was fitted
-    assert f"# {table}: sha256 of its drives " in text
+    assert f"# {table}: sha256 of its trajectories " in text
 
 
 @pytest.mark.slow

@@ -36,9 +36,9 @@ def test_a_browser_draws_it_without_an_error(page):
 def test_a_link_shows_its_drive_and_seconds(page):
     dom, log = opened(page, "--dump-dom", "--window-size=1280,2000", anchor="#run=0&drive=3&from=1&to=2.5")
     assert "CONSOLE" not in log, log
-    assert 'role="status">before, drive 4, 1.0 to 2.5 s<' in dom
+    assert 'role="status">before, trajectory 4, 1.0 to 2.5 s<' in dom
     dom, _ = opened(page, "--dump-dom", anchor="#run=99&drive=-7&from=x&to=y")
-    assert 'role="status">after, drive 1, all seconds<' in dom
+    assert 'role="status">after, trajectory 1, all seconds<' in dom
 
 
 @pytest.mark.slow
@@ -78,7 +78,7 @@ def test_in_a_notebooks_frame_it_answers_as_well(page):
     notebook.write_text(f'<title>nothing</title><iframe srcdoc="{escape(inside)}"></iframe>')
     dom, log = opened(notebook, "--dump-dom")
     assert "CONSOLE" not in log, log
-    assert "<title>after, drive 2, all seconds</title>" in dom
+    assert "<title>after, trajectory 2, all seconds</title>" in dom
 
 
 @pytest.mark.slow
@@ -119,15 +119,16 @@ def test_a_link_that_was_followed_can_be_followed_again(page):
     setTimeout(take, 500);
     """
     first, chosen_by_hand, again = lines_of(page, script, "again.html")
-    assert first == again == "before, drive 4, 1.0 to 2.0 s" and chosen_by_hand == "before, drive 2, all seconds"
+    assert first == again == "before, trajectory 4, 1.0 to 2.0 s"
+    assert chosen_by_hand == "before, trajectory 2, all seconds"
 
 
 @pytest.mark.slow
 def test_addresses_that_are_nonsense_show_what_is_nearest(page):
     for anchor, shown in (
-        ("#run=99&drive=99&from=500&to=600", "after, drive 6, all seconds"),
-        ("#run=0&drive=0&from=5&to=1e9", "before, drive 1, 5.0 to 10.0 s"),
-        ("#run=0&drive=0&from=-50&to=-40", "before, drive 1, all seconds"),
+        ("#run=99&drive=99&from=500&to=600", "after, trajectory 6, all seconds"),
+        ("#run=0&drive=0&from=5&to=1e9", "before, trajectory 1, 5.0 to 10.0 s"),
+        ("#run=0&drive=0&from=-50&to=-40", "before, trajectory 1, all seconds"),
     ):
         dom, log = opened(page, "--dump-dom", anchor=anchor)
         assert "CONSOLE" not in log and f'role="status">{shown}<' in dom, anchor

@@ -161,7 +161,7 @@ def test_what_is_the_networks_alone_is_refused_elsewhere() -> None:
         ("svi", "betas", (0.9,), "two numbers"),
         ("svi", "betas", "ab", "two numbers"),
         ("svi", "betas", (0.9, 0.99, 0.999), "two numbers"),
-        ("fit-hand", "hand", 5, "a program, or where it is"),
+        ("fit-hand", "hand", 5, "a model, or where it is"),
     ],
 )
 def test_settings_that_mean_nothing_are_refused(recipe: str, setting: str, value: float, wanted: str) -> None:
@@ -181,7 +181,7 @@ def test_noise_that_is_not_normal_needs_the_mean_field_guide(guide: str) -> None
     if guide == "mean-field":
         assert learned("svi", program, simulated(rows=5), **call).trained.kept == 1
         return
-    with pytest.raises(UsageError, match="begins at the linearised program.*guide mean-field does without"):
+    with pytest.raises(UsageError, match="begins at the linearised model.*guide mean-field does without"):
         learned("svi", program, simulated(rows=5), **call)
 
 

@@ -230,7 +230,7 @@ def test_parameters_that_do_not_fit_the_program_are_named(tmp_path: Path, copy: 
     )
     for old, new, named in changes:
         copy.write_text(HOVERCRAFT.read_text().replace(old, new))
-        with pytest.raises(RunError, match=f"do not fit program Hovercraft: {named}"):
+        with pytest.raises(RunError, match=f"do not fit model Hovercraft: {named}"):
             Fit.load(tmp_path / "run", copy)
 
 

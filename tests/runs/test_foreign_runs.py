@@ -122,7 +122,7 @@ def test_a_record_that_names_its_program_strangely_is_damaged(tmp_path: Path, ru
     if isinstance(program, dict):
         program = {"sha256": hashlib.sha256(own.read_bytes()).hexdigest(), **program}
     rerecorded(run, program=program)
-    with pytest.raises(st.RunError, match=r"run\.json is damaged: (it does not say which program|program)"):
+    with pytest.raises(st.RunError, match=r"run\.json is damaged: (it does not say which model|program)"):
         st.Fit.load(run)
     assert not (tmp_path / "executed").exists()
 

@@ -96,7 +96,7 @@ def test_it_is_a_recipe_of_the_command_line(tmp_path: Path, lighter, capsys):
     tables = [written(tmp_path / f"{name}.csv", data) for name, data in zip(("train", "valid"), lighter, strict=True)]
     command = ("fit", HOVERCRAFT, tables[0], "--valid", tables[1], "--recipe", "likelihood", "--known-start")
     assert steady(*command, "--out", tmp_path / "run") == 0
-    assert "held-out log p(y) of a drive" in capsys.readouterr().out
+    assert "held-out log p(y) of a trajectory" in capsys.readouterr().out
     assert json.loads((tmp_path / "run/run.json").read_text())["recipe"] == "likelihood"
     assert float(st.Fit.load(tmp_path / "run").program.mass.detach()) == pytest.approx(1.2, rel=0.05)
 

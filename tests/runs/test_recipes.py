@@ -315,7 +315,7 @@ def test_noise_that_cannot_be_linearised_is_steadys(tmp_path: Path, monkeypatch:
     monkeypatch.setattr("steady_ppl.gaussian.linearize.why_not_linear", lambda *_, **__: "its noise is Laplace")
     assert suited_recipe(example("hovercraft"), table, {}) == (
         "steady",
-        "likelihood needs a program that can be linearised: its noise is Laplace",
+        "likelihood needs a model that can be linearised: its noise is Laplace",
     )
 
 

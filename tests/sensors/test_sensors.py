@@ -195,7 +195,7 @@ def test_sensors_that_an_own_observe_leaves_out_are_not_carried() -> None:
     probe(program)
     assert program.sensor_columns == {} and "sensor_delay" not in variants(program)
     assert variants(program)["sensor_bias"] == ["sensor_bias:depth"]
-    with pytest.raises(st.UsageError, match="the program lists no `sensors`"):
+    with pytest.raises(st.UsageError, match="the model lists no `sensors`"):
         chosen_variant(program, "sensor_delay")
 
 

@@ -52,7 +52,7 @@ def test_a_folder_that_is_no_study_is_said(tmp_path: Path, capsys):
         ('program = "{model}"', 'program = "{model}:Nobody"', "Nobody"),
         ("test = 2", "test = 2\nsigma_deg = 3", "no bearing_sd that sigma_deg could set"),
         ("test = 2", 'test = 2\neffect = "zzz"', "zzz"),
-        ('simulate = "{model}"', 'simulate = "{model}:Nobody"', "data: linear_gaussian.py has no program Nobody"),
+        ('simulate = "{model}"', 'simulate = "{model}:Nobody"', "data: linear_gaussian.py has no model Nobody"),
         ('simulate = "{model}"', 'simulate = "nowhere.py"', "nowhere.py cannot be read"),
         (
             'program = "{model}"',

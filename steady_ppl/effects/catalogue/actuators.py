@@ -15,7 +15,7 @@ from steady_ppl.model.actuation import delayed, lagged, row_spans, with_play
 from steady_ppl.model.program import Program
 from steady_ppl.model.roles import controls_of
 
-CONTROLS: Need = (lambda program: program.controls, "the program has no controls")
+CONTROLS: Need = (lambda program: program.controls, "the model has no controls")
 SUBSTEPS: Need = (lambda program: program.substeps > 1, "it takes a row in one step (fit with --substeps)")
 STEERS = has_role("turn", "rudder", "steering")
 LINKAGE = has_role("rudder", "steering")
@@ -159,7 +159,7 @@ def dead_zone(self: Program, control: Tensor, time: Tensor, c: Tensor, controls:
     lacks=needs(LINKAGE),
 )
 def backlash(self: Program, control: Tensor, time: Tensor, c: Tensor, controls: Names) -> Tensor:
-    r"""u_acting stays while |u - u_acting| < c, and else follows at that distance; a drive begins in the middle
+    r"""u_acting stays while |u - u_acting| < c, and else follows at that distance; a trajectory begins in the middle
 
     equation: u_\mathrm{acting} \to \max(u - c, \min(u + c, u_\mathrm{acting}))
     feels: does nothing at first when it is steered the other way
@@ -208,10 +208,10 @@ def first_order_hold(self: Program, control: Tensor, time: Tensor, c: Tensor) ->
 
 @_on_controls("1", typical=0.25, limit=1.0, sign=1)
 def battery_sag(self: Program, control: Tensor, time: Tensor, c: Tensor) -> Tensor:
-    r"""u → (1 - c t/T) u, T the program's duration
+    r"""u → (1 - c t/T) u, T the model's duration
 
     equation: u \to (1 - c\,t / T)\,u
-    feels: weaker towards the end of every drive
+    feels: weaker towards the end of every trajectory
     occurs: small vehicles on one battery without a voltage regulator
     """
     return control * (1 - c * time / self.duration).unsqueeze(-1)

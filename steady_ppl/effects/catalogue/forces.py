@@ -23,7 +23,7 @@ KNEE_SPEED = 0.05  # m/s; a friction's knee where nothing is known of speeds
 SHARES_OF_SPEED = (0.1, 0.02)  # of the root mean square speed, that a friction's knee can be
 STARTS = 500  # drawn, where nothing else says where a vehicle goes
 
-AXES: Need = (lambda program: program.axes, "the program does not say which channels move what (`motion`)")
+AXES: Need = (lambda program: program.axes, "the model does not say which channels move what (`motion`)")
 SPRINGS: Need = (lambda program: any(p for p, _ in program.motion.values()), "no channel has a position (`motion`)")
 BODY: Need = (
     lambda program: {"forward", "lateral"} <= set(program.axes.get("translation", ())),
@@ -32,7 +32,7 @@ BODY: Need = (
 ONE_COMPONENT: Need = (lambda program: not BODY[0](program), "it has two components there")
 YAW: Need = (lambda program: "yaw" in program.axes, "there is no yaw channel")
 PLANAR: Need = (lambda program: isinstance(program, PlanarVehicle), "it acts on vehicles in the plane only")
-SLIP: Need = (lambda program: program.slips, "the program holds the lateral velocity at zero")
+SLIP: Need = (lambda program: program.slips, "the model holds the lateral velocity at zero")
 THRUSTS = (has_role("left"), has_role("right"))
 
 
@@ -319,7 +319,7 @@ def magnus(self: Program, state: Tensor, *_: Tensor, c: Tensor) -> Pushes:
     equation: a_\mathrm{lateral} = -c\,v_x\,\omega
     feels: curves carry it to the inside (or outside)
     occurs: spinning hulls and balls; the added mass of hulls (the u r term of Fossen 2011, chapter 6); the centripetal
-        term of a program that forgot that its frame turns
+        term of a model that forgot that its frame turns
     """
     forward, _, yaw_rate = self.body_velocity(state)
     return {"lateral": -c * forward * yaw_rate}

@@ -24,12 +24,12 @@ from steady_ppl.model.planar_vehicle import PlanarVehicle
 from steady_ppl.model.program import Program
 from steady_ppl.model.roles import controls_of
 
-CHANNELS: Need = (lambda program: program.channels, "the program has no noise channels")
+CHANNELS: Need = (lambda program: program.channels, "the model has no noise channels")
 MOTION: Need = (
     lambda program: isinstance(program, PlanarVehicle) or program.motion,
-    "the program does not say which channels move what (`motion`)",
+    "the model does not say which channels move what (`motion`)",
 )
-MEASURED: Need = (lambda program: program.measurements, "the program measures nothing")
+MEASURED: Need = (lambda program: program.measurements, "the model measures nothing")
 
 
 def _groups(program: Program, data: Trajectories | None) -> Choices:
@@ -126,8 +126,8 @@ def process_noise(self: Program, *_: Tensor, c: Tensor, channels: Names) -> Push
     r"""σ → c σ of a channel
 
     equation: \sigma \to c\,\sigma
-    feels: rougher (or smoother) than the program says
-    occurs: a floor, a sea or a wind that is rougher than was thought; whatever else a program leaves out
+    feels: rougher (or smoother) than the model says
+    occurs: a floor, a sea or a wind that is rougher than was thought; whatever else a model leaves out
     """
     return dict.fromkeys(channels, c)
 

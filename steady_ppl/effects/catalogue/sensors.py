@@ -70,15 +70,15 @@ def _named(sensors: Mapping[str, tuple[int, ...]]) -> Iterator[tuple[dict[str, s
 
 BEARINGS: Need = (
     lambda program: program.sees_bearings or sensors_of(program, "bearing"),
-    "it acts on bearings to landmarks, and the program measures something else",
+    "it acts on bearings to landmarks, and the model measures something else",
 )
 ALONE_OR_LISTED: Need = (
     lambda program: program.sees_bearings or lists_sensors(program),
-    "beside other readings of a program's own it is sensor_bias",
+    "beside other readings of a model's own it is sensor_bias",
 )
 LANDMARKS: Need = (
     lambda program: program.sees_bearings or sensors_of(program, *SEES_LANDMARKS),
-    "it acts on bearings or distances to landmarks, and the program measures something else",
+    "it acts on bearings or distances to landmarks, and the model measures something else",
 )
 TWO_LANDMARKS: Need = (lambda program: len(program.landmarks) != 1, "there is one landmark: its bias is that of all")
 OTHER_SENSORS: Need = (
@@ -93,7 +93,7 @@ WITH_SCALE: Need = (
     lambda program: not lists_sensors(program) or sensors_of(program, *SCALED),
     "of positions and headings no size is measured",
 )
-LISTED: Need = (lists_sensors, "the program lists no `sensors`")
+LISTED: Need = (lists_sensors, "the model lists no `sensors`")
 POSE: Need = (
     lambda program: _each_in_pose(program, None),
     "what its sensors read a moment ago does not follow from the state",

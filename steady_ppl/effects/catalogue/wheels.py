@@ -79,7 +79,7 @@ _on_two_wheels = partial(declare, WHEELS, "history", lacks=needs(*TWO_WHEELS))
 def response_time(
     self: Program, state: Tensor, control: Tensor, time: Tensor, step: Tensor, c: Tensor, channels: Names, mean: Means
 ) -> Pushes:
-    r"""dv/dt = (v_told - v) / (c + τ), τ what the program has (its step where it says nothing)
+    r"""dv/dt = (v_told - v) / (c + τ), τ what the model has (its step where it says nothing)
 
     equation: \dot v = (v_\mathrm{told} - v) / (c + \tau)
     feels: reaches its command, or returns to it when pushed off, little by little
