@@ -11,10 +11,10 @@ from small import MODELS
 
 
 def test_a_map_is_moved_and_turned_but_neither_mirrored_nor_stretched():
-    true = torch.tensor([[0.0, 0.0], [4.0, 0.0], [4.0, 3.0], [1.0, 5.0]])
+    true = torch.tensor([[0.0, 0.0], [4.0, 0.0], [4.0, 3.0], [1.0, 5.0]], dtype=torch.float64)
     c, s = math.cos(2.0), math.sin(2.0)
-    turned = true @ torch.tensor([[c, -s], [s, c]]) + torch.tensor([7.0, -9.0])
-    assert real.off_when_aligned(turned, true) < 1e-5
+    turned = true @ torch.tensor([[c, -s], [s, c]], dtype=torch.float64) + torch.tensor([7.0, -9.0])
+    assert real.off_when_aligned(turned, true) < 1e-9
     assert real.off_when_aligned(true * torch.tensor([-1.0, 1.0]), true) > 0.5
     centred = true - true.mean(0)
     assert real.off_when_aligned(1.1 * true, true) == pytest.approx(0.1 * float(centred.square().sum(-1).mean().sqrt()))
