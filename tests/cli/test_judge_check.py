@@ -31,7 +31,7 @@ def test_it_prints_the_verdict_first_and_writes_the_same_figures_and_a_picture(w
 def test_one_drive_is_enough(work: Path, tmp_path: Path, capsys):
     table = written(tmp_path / "one.csv", simulated(trajectories=1, rows=33))
     assert steady("check", work / "hand", table, *FAST) == 0
-    assert "drive" in capsys.readouterr().out.splitlines()[0]
+    assert "this trajectory" in capsys.readouterr().out.splitlines()[0]
 
 
 def test_what_it_cannot_read_is_one_line_and_writes_nothing(work: Path, tmp_path: Path, refused):

@@ -247,9 +247,9 @@ def test_resume_needs_the_same_everything(tmp_path: Path, refused) -> None:
     resume("seed", options=(*FEW, "--seed", 1))
     resume("known_start", options=(*FEW, "--known-start"))
     resume("recipe", options=("--recipe", "fit-truth", "--steps", 3))
-    resume("program", model=f"{program}:HovercraftTruth")
+    resume("model", model=f"{program}:HovercraftTruth")
     program.write_text(program.read_text().replace("tensor(1.5)", "tensor(1.6)"))
-    resume("program")
+    resume("model")
 
 
 def test_a_recipe_that_keeps_no_checkpoint_cannot_be_resumed(work: Path, refused) -> None:
