@@ -161,13 +161,17 @@ def _together(each: Array) -> tuple[float, float]:
     return together, -math.expm1(math.log1p(-CHECK_LEVEL) / effective)
 
 
+def _nearly_normal(name: str, values: Array) -> Array:
+    """Mean squares by their logarithms: where a fit leaves the noise open by a factor they are far from normal."""
+    return np.log(np.maximum(values, 1e-12)) if name.startswith(SCATTER) else values
+
+
 def attribute(scores: Scored, parameters: Scored, noise: dict[str, Array], maps: Array) -> Attribution:
-    """Decide who is at fault by the two of `scored`, by logarithms of mean squares and the like, and by the p-values of
-    the hypothesis that the maps hold nothing, each of the real and every simulated set `(1 + M,)`."""
-    squares_of = np.exp(np.stack([values for name, values in noise.items() if name.startswith(SCATTER)]))
-    scatter = squares_of / squares_of[:, 1:].mean(1, keepdims=True)
+    """Decide who is at fault by the two of `scored`, by mean squares and the like, and by the p-values of the
+    hypothesis that the maps hold nothing, each of the real and every simulated set `(1 + M,)`."""
+    scatter = np.stack([values / values[1:].mean() for name, values in noise.items() if name.startswith(SCATTER)])
     widest = scatter.max(0)[:, None]  # wrong noise scatters no score wider
-    squares, _ = standardise(np.stack(list(noise.values()), -1))
+    squares, _ = standardise(np.stack([_nearly_normal(*one) for one in noise.items()], -1))
     each = {
         "mean": scores.p_values(widest),
         "parameters": parameters.p_values(widest),

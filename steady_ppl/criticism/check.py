@@ -156,7 +156,7 @@ def check(
         held=last_measurement(problem, real.smoothed, rows),
         step=step,
         misfit=misfit,
-        blame=attribute(scores, parameters, scatter_of(both), misfit.p_values),
+        blame=attribute(scores, parameters, _scatter(both), misfit.p_values),
         residuals=list(ours.names),
         standardised=ours,
         stuck=frozen_stretches(data),
@@ -207,11 +207,10 @@ def _pairs(program: Program, residuals: Residuals) -> list[tuple[str, str]]:
     return [pair for pair in dict.fromkeys(chosen) if all(name in residuals.variables for name in pair)]
 
 
-def scatter_of(both: Residuals) -> dict[str, np.ndarray]:
-    """Logarithms of every residual's mean square, and of its kurtosis as a sign of tails; of every set. Where the noise
-    is open by a factor, mean squares themselves are far from normal."""
+def _scatter(both: Residuals) -> dict[str, np.ndarray]:
+    """Mean squares of every residual, and the fourth power of the measurements' as a sign of tails; of every set."""
     squares, count = both.mean_squares, np.maximum(both.there.sum((1, 2)), 1)
     told = {i: name for i, name in enumerate(both.names) if both.there[0, ..., i].any()}
     tails = np.log((both.values**4).sum((1, 2)) / count / np.maximum(squares, 1e-12) ** 2 + 1e-12)
-    found = {f"{SCATTER}{name}": np.log(np.maximum(squares[:, i], 1e-12)) for i, name in told.items()}
+    found = {f"{SCATTER}{name}": squares[:, i] for i, name in told.items()}
     return found | {f"tails of {name}": tails[:, i] for i, name in told.items()}

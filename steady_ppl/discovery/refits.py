@@ -172,11 +172,14 @@ def first_refit(problem: Problem, valid: Trajectories, *, seed: int, nearer: Pro
     return replace(_refit(programs, folds, [one, second]), unwidened=unwidened)
 
 
-def _from(start: Program, problem: Problem, maximum: Maximum) -> tuple[Problem, Maximum]:
-    """A fit, or the one that begins at the parameters of `start`, if that is likelier: there may be several maxima."""
+def _from(
+    start: Program, problem: Problem, maximum: Maximum, path: ReferencePath | None = None
+) -> tuple[Problem, Maximum]:
+    """A fit, or the one that begins at the parameters of `start`, if that is likelier: there may be several maxima. It
+    begins along the fit's own paths where no `path` is given."""
     again = replace(problem, program=copy.deepcopy(start))
     with suppress(FilterError):  # the drives cannot be followed from there
-        found = maximise(again, maximum.path)
+        found = maximise(again, path or maximum.path)
         if found.objective > maximum.objective + MIN_GAIN_OF_START:
             return again, found
     return problem, maximum
@@ -385,12 +388,12 @@ def _refit(
         own, others = float(maximum.log_likelihood.sum()), float(judged.sum())
         if own < threshold.drives and (threshold.stops_early or others < threshold.held_out):
             break
+    judges = Judges(fitted, found)
     if len(fitted) == len(folds) and fitting == BY_LIKELIHOOD:
         _begin_where_the_other_ended(fitted, found, held_out, judged_folds)
-    judges, alone = Judges(fitted, found), torch.cat(held_out)
-    if len(fitted) == len(folds) and fitting == BY_LIKELIHOOD:
         problems = [fold.fitting(program) for program, fold in zip(fitted, judged_folds, strict=True)]
         judges = with_common_noise(problems, found)
+    alone = torch.cat(held_out)
     if judges.common:
         held_out = [
             fitting.judge(fold.judging(program), fold.held_out_path)[0]
@@ -407,13 +410,14 @@ def _begin_where_the_other_ended(
     for index, other in ((0, 1), (1, 0)):
         if float(held_out[other].sum() - maxima[index].log_likelihood.sum()) <= MIN_GAIN_OF_START:
             continue
-        fold, problem = folds[index], folds[index].fitting(copy.deepcopy(programs[other]))
-        with suppress(FilterError):  # the drives cannot be followed from there
-            again = maximise(problem, folds[other].held_out_path)
-            if again.objective > maxima[index].objective + MIN_GAIN_OF_START:
-                judged, held_out_path = BY_LIKELIHOOD.judge(fold.judging(problem.program), folds[other].path)
-                programs[index], maxima[index], held_out[index] = problem.program, again, judged
-                folds[index] = replace(fold, path=again.path, held_out_path=held_out_path)
+        fold, ahead = folds[index], folds[other]
+        problem, again = _from(programs[other], fold.fitting(programs[index]), maxima[index], ahead.held_out_path)
+        if again is maxima[index]:
+            continue
+        with suppress(FilterError):  # it cannot follow the drives that it was not fitted to
+            judged, path = BY_LIKELIHOOD.judge(fold.judging(problem.program), ahead.path)
+            programs[index], maxima[index], held_out[index] = problem.program, again, judged
+            folds[index] = replace(fold, path=again.path, held_out_path=path)
 
 
 def _fits(

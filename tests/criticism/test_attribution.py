@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from steady_ppl.criticism.attribution import Scored, attribute
-from steady_ppl.criticism.check import scatter_of
+from steady_ppl.criticism.check import _scatter
 from steady_ppl.criticism.residual_maps import Residuals
 
 SETS, REPEATS, LEVEL = 100, 1000, 0.001
@@ -18,7 +18,7 @@ def p_value_of_noise(seed: int, log_sd: float) -> float:
     values = scale * random.normal(size=(1 + SETS, 20, 5, 1))
     residuals = Residuals(["speed"], values, np.ones(values.shape, bool))
     scores = Scored(["dynamics"], ["push"], random.normal(size=(1 + SETS, 1)), np.eye(1), np.ones((1 + SETS, 1)))
-    return attribute(scores, scores, scatter_of(residuals), random.uniform(size=1 + SETS)).p_values["noise"]
+    return attribute(scores, scores, _scatter(residuals), random.uniform(size=1 + SETS)).p_values["noise"]
 
 
 def test_noise_that_a_fit_leaves_open_is_reported_at_the_nominal_rate() -> None:
